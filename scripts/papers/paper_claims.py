@@ -57,9 +57,9 @@ def _faster(reports: Mapping[str, Report]) -> str:
     return _claim(
         "I-MC is faster than T-MC.",
         verdict,
-        f"T-MC takes {each} times as long as I-MC on the phantoms of 54, 149 and 559 slices, respectively. The paper's "
-        f"own T-MC welds its triangles afterwards. I-MC is {soup:.0f} times faster than such a T-MC in NumPy (T-MC, "
-        "soup). So the gain comes from shared vertices and not from growing.",
+        f"T-MC takes {each} times as long as I-MC on the phantoms of 54, 149 and 559 slices, respectively. T-MC "
+        f"of the paper welds its triangles afterwards; I-MC is {soup:.0f} times faster than T-MC, soup, which does the "
+        "same in NumPy. So the gain of I-MC comes from shared vertices and not from growing.",
     )
 
 
@@ -93,9 +93,9 @@ def _accuracy(report: Report) -> str:
     return _claim(
         f"Accuracy above {ACCURACY_OF_PAPER:.1%}.",
         verdict,
-        f"The recall of T-MC's cells is {each}. I-MC makes only the components that its seeds select, and there it "
-        "passes through all of T-MC's cells. The same is true with vertices at the golden section (precision "
-        f"{golden['cells']['precision']:.1%}), because the measure does not detect where in a cell the surface lies.",
+        f"The recall of the cells of T-MC is {each}. I-MC leaves out the components without a seed; in the others it "
+        "passes through the same cells as T-MC. So does I-MC with vertices at the golden section (precision "
+        f"{golden['cells']['precision']:.1%}), because recall does not show where in a cell the surface lies.",
     )
 
 
@@ -105,7 +105,7 @@ def _visited(reports: Mapping[str, Report], growing: Mapping[str, Any] | None) -
         row = _rows(reports[name]).get("i-mc")
         if row and row["cells_visited"]:
             shares.append(row["cells_all"] / row["cells_visited"])
-    verdict = "Holds." if shares and min(shares) >= VISITED_OF_PAPER else "Depends on the region that is grown."
+    verdict = "Holds." if shares and min(shares) >= VISITED_OF_PAPER else "Depends on the grown region."
     each = ", ".join(f"one cell in {share:.0f}" for share in shares)
     figures = f"With automatic seeds, I-MC visits {each} on the phantoms of 54, 149 and 559 slices, respectively."
     if growing is not None:
@@ -113,7 +113,7 @@ def _visited(reports: Mapping[str, Report], growing: Mapping[str, Any] | None) -
         share = few["cells_all"] / few["cells_visited"]
         figures += (
             f" On the last phantom, with seeds in {few['vertebrae']} of 17 vertebrae, I-MC visits one cell in"
-            f" {share:.0f}. The ratio is a property of the region, not of the method."
+            f" {share:.0f}. So the number depends on the grown region, not on the method."
         )
     return _claim(f"About {VISITED_OF_PAPER} times fewer voxels visited.", verdict, figures)
 
@@ -130,8 +130,8 @@ def _ssim(report: Report) -> str:
     return _claim(
         "SSIM of 0.56 shows the better reconstruction.",
         verdict,
-        f"An all-black picture has an SSIM of {black:.2f}, the best picture of a method here has {best:.2f}, and the "
-        f"next slice of the same scan has {found['controls']['next']['ssim']:.2f}.",
+        f"The SSIM is {black:.2f} for a black picture, at most {best:.2f} for the methods here, and "
+        f"{found['controls']['next']['ssim']:.2f} for the next slice of the same scan.",
     )
 
 
@@ -139,7 +139,7 @@ def _latency(report: Report) -> str:
     rows = _rows(report)
     return _claim(
         f"Marching cubes take {FIRST_OF_A:g} s on a CPU and {LATER_OF_A:g} s on a GPU.",
-        "Not today.",
+        "No longer holds.",
         f"scikit-image takes {rows['skimage']['warm_s']:.2f} s on the CPU. clrecon takes "
         f"{rows['t-mc']['first_s']:.2f} s in the first run and {rows['t-mc']['warm_s']:.2f} s in later runs, on the "
         "device named above.",

@@ -121,7 +121,10 @@ def _anchor(heading: str) -> str:
 
 def table_of_functions(rows: Sequence[PaperFunction]) -> list[str]:
     """Return the table in Markdown, a line each."""
-    lines = ["| | function | paper | command | Python | test | figure |", "|---|---|---|---|---|---|---|"]
+    lines = [
+        "| number | function | section of the paper | command | Python | test in `tests/` | figures |",
+        "|---|---|---|---|---|---|---|",
+    ]
     for row in rows:
         command = "" if row.command is None else f"`clrecon {row.command}`".replace("|", "\\|")
         name = "" if row.python is None else f"`{row.python.replace(':', '.')}`"

@@ -25,55 +25,55 @@ clrecon implements the methods of two papers on the reconstruction of vertebrae:
 - **Paper B** is Liu et al., "Vertebrae CT Images 3D Reconstruction with Improve Marching Cubes Algorithm", J. Harbin
   Inst. Technol. (New Series) 26(6): 69-79, 2019, DOI 10.11916/j.issn.1005-9113.18042.
 
-This page repeats the measurements of both papers with clrecon, gives a verdict on each of their claims, and lists where
-each of their functions is in clrecon. A script writes the page from the reports of `clrecon compare`
+This page repeats the measurements of both papers with clrecon, gives a verdict on each of their claims, and lists the
+command and the Python name of each of their functions. A script writes the page from the reports of `clrecon compare`
 (`docs/papers/*.json`):
 
     python3 scripts/papers/papers.py run --work FOLDER --paper-a CT_FOLDER
     python3 scripts/papers/papers.py page
 
 The scans of the papers are not public. Paper B is repeated on synthetic spines (`clrecon phantom --levels`) with the
-numbers of slices and vertebrae that the paper used. Paper A is repeated on a chest CT of the same size as the paper's
-scan. [measures.md](measures.md) defines the measures, and [compare.md](compare.md) describes all methods. The main ones
+paper's numbers of slices and vertebrae. Paper A is repeated on a chest CT with as many voxels as the paper's scan.
+[measures.md](measures.md) defines the measures, and [compare.md](compare.md) describes all methods. The main methods
 are:
 
 | name | method |
 |---|---|
 | T-MC | marching cubes over every cell; neighbouring cells share their vertices |
-| T-MC, soup | the same, but each cell has its own vertices, which are welded afterwards (in NumPy) |
+| T-MC, soup | T-MC in NumPy, with separate triangles in every cell that are welded afterwards |
 | VTK MC, VTK FE | vtkMarchingCubes and vtkFlyingEdges3D |
-| I-MC | only the cells that are connected to seed points |
+| I-MC | marching cubes only in cells that are connected to seed points |
 | I-MC, golden | I-MC with each vertex at the golden section of its edge |
-| G-MC | T-MC, then edges are collapsed by quadric error, without an error bound |
+| G-MC | T-MC, then decimation by quadric error, without an error bound |
 | S-MC | T-MC, then decimation within an error bound; the topology is preserved |"""
 
 _SLICES = """## Sub-voxel slices
 
-Two surfaces can pass through the same cells and still be far apart. clrecon therefore also compares mesh and scan on a
-finer lattice: its points are three times as dense as the voxels and do not lie in the planes of the voxels. On the
-lattice of the voxels, every surface with one vertex on each crossed edge looks perfect. Only the finer lattice shows
-the error of paper B's golden constant, which places each vertex at 0.618 of its edge. HD95 is the 95th percentile of
-the distances to the surface of T-MC."""
+Two surfaces can pass through the same cells and still be far apart. clrecon therefore compares the inside of a mesh
+with the inside of the trilinear iso surface of the scan on two lattices of points: the voxels, and a lattice that is
+three times finer and avoids the planes of the voxels. On the voxels, every surface with one vertex on each crossed edge
+has a Dice coefficient of 1. Only the finer lattice shows the error of paper B's golden section, which places each vertex at
+0.618 of its edge. HD95 is the 95th percentile of the distances to the surface of T-MC."""
 
 _TIMES = """## Paper B, time
 
-Paper B gives its times in Tables 2 and 3. The printed tables are images without legible numbers, so the tables here
-have only clrecon's times. A time is in seconds, from the voxels in memory to the mesh in memory. "First" is the first
-call in a new process, "later" is the median of later calls. The last column is the number of cells in the volume for
-each cell that the growing of I-MC visits."""
+Paper B gives its times in Tables 2 and 3, as images without legible numbers. So the tables here have only clrecon's
+times, in seconds, from the voxels in memory to the mesh in memory. "First" is the first call in a new process, "later"
+is the median of later calls. The last column is the number of cells of the volume, divided by the number of cells that
+I-MC visits."""
 
 _ACCURACY = """## Paper B, accuracy
 
 Table 1 and Fig. 9 of paper B define accuracy as the share of "characteristic voxels" that a method repeats. This is the
-recall of the cells that T-MC passes through. Recall does not show where in a cell the surface lies, so the table also
-has the distance of each surface from the true surface. The mean distance (bias) depends on the iso value, the standard
-deviation (scatter) on the method."""
+recall of the cells that T-MC passes through. Recall does not show where in a cell the surface lies. The table therefore
+also has the mean signed distance from the true surface (bias) and its standard deviation (scatter). Bias depends on the
+iso value, scatter on the method."""
 
 _SSIM = """## Paper A, SSIM
 
-Paper A compares a picture of the reconstruction with a slice by SSIM and MSE. It does not say how its pictures were
-aligned with the slice. Here, pictures and slice have the same size and position, and a window of -200 to 800 HU. The
-controls in the last five rows are not reconstructions. They show which scores are reached without one."""
+Paper A compares a picture of the reconstruction with a slice by similarity (SSIM) and mean squared error of the grey
+values (MSE). The paper does not say how its pictures were aligned with the slice. Here, pictures and slice have the
+same size and position, and a window of -200 to 800 HU. The last five rows are controls: pictures that no method made."""
 
 
 def make_page(reports: Mapping[str, Report], growing: Mapping[str, Any] | None, rows: Sequence[PaperFunction]) -> str:
@@ -92,7 +92,7 @@ def make_page(reports: Mapping[str, Report], growing: Mapping[str, Any] | None, 
     parts += ["## Claims", *judge_claims(reports, growing)]
     parts += [
         "## Functions",
-        "The table lists every function in the papers. The last column links to the pages that have figures for it.",
+        "The table lists the functions of both papers. The last column links to the page with figures for each.",
     ]
     parts += ["\n".join(table_of_functions(rows))]
     return "\n\n".join(part if part.startswith(("|", "#")) else _wrap(part) for part in parts) + "\n"
@@ -136,6 +136,9 @@ def _of(row: Mapping[str, Any], *names: str) -> Any:
     return value
 
 
+_BEFORE = {"a": "Chest CT of", "b149": "Spine phantom of"}
+
+
 def _slices(reports: Mapping[str, Report]) -> list[str]:
     tables = []
     for name in ("a", "b149"):
@@ -148,7 +151,7 @@ def _slices(reports: Mapping[str, Report]) -> list[str]:
             for row in _done(report) if row["slices"]
         ]  # fmt: skip
         tables += [
-            f"{SETS[name].what}, {report['iso_value_hu']:g} HU:",
+            f"{_BEFORE[name]} {SETS[name].what}, iso value {report['iso_value_hu']:g} HU:",
             _table(("method", "triangles", "Dice, lattice of voxels", "Dice, finer lattice", "HD95 to T-MC, mm"), rows),
         ]
     return tables
@@ -174,7 +177,7 @@ def _table_1(reports: Mapping[str, Report]) -> list[str]:
         if name not in PAPER
     ]
     read = report["read_s"]
-    head = ("row of the paper", "paper, s", "paper, later, s", "method here", "first run, s", "later runs, s")
+    head = ("row of the paper", "paper, first run, s", "paper, later, s", "method here", "first run, s", "later, s")
     return [
         "## Paper A, Table 1",
         "The scan has 512 x 512 x 95 voxels, as in the paper. The paper used a Core i5 and a GTX 1050. Reading the "
@@ -212,14 +215,14 @@ def _accuracy(report: Report) -> list[str]:
         for row in _done(report) if row["cells"]
     ]  # fmt: skip
     head = ("method", "recall of cells", "precision", "Dice", "bias, mm", "scatter, mm")
-    return [f"{SETS['b149'].what}, {report['iso_value_hu']:g} HU:", _table(head, rows)]
+    return [f"{_BEFORE['b149']} {SETS['b149'].what}, iso value {report['iso_value_hu']:g} HU:", _table(head, rows)]
 
 
 _TIMED = ("t-mc", "g-mc", "s-mc", "i-mc", "i-mc-golden")
 
 
 def _times(reports: Mapping[str, Report], growing: Mapping[str, Any] | None) -> list[str]:
-    head = ("series", "vertebrae", "", "T-MC", "G-MC", "S-MC", "I-MC", "I-MC, golden", "cells / visited")
+    head = ("series", "vertebrae", "", "T-MC", "G-MC", "S-MC", "I-MC", "I-MC, golden", "cells / cells visited")
     tables = []
     for names in (("b54", "b149", "b559"), ("v2", "v3", "v4", "v5", "v12", "b559")):
         rows = []
@@ -239,8 +242,10 @@ def _times(reports: Mapping[str, Report], growing: Mapping[str, Any] | None) -> 
             for each in growing["rows"]
         ]  # fmt: skip
         tables += [
-            f"The next table has I-MC with seeds in only some of the vertebrae, for {SETS['b559'].what}. Its times are "
-            "divided by the time of T-MC for the whole series. Both start from a volume on the device:",
-            _table(("vertebrae with seeds", "cells visited", "cells / visited", "time / T-MC"), rows),
+            f"The next table is for I-MC with seeds in some of the vertebrae of the phantom of {SETS['b559'].what}. T-MC "
+            "makes the whole surface. Both start from a volume on the device:",
+            _table(
+                ("vertebrae with seeds", "cells visited", "cells / cells visited", "time of I-MC / time of T-MC"), rows
+            ),
         ]
     return tables
