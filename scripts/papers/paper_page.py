@@ -52,8 +52,8 @@ _SLICES = """## Sub-voxel slices
 Two surfaces can pass through the same cells and still be far apart. clrecon therefore compares the inside of a mesh
 with the inside of the trilinear iso surface of the scan on two lattices of points: the voxels, and a lattice that is
 three times finer and avoids the planes of the voxels. On the voxels, every surface with one vertex on each crossed edge
-has a Dice coefficient of 1. Only the finer lattice shows the error of paper B's golden section, which places each vertex at
-0.618 of its edge. HD95 is the 95th percentile of the distances to the surface of T-MC."""
+has a Dice coefficient of 1. Only the finer lattice shows the error of paper B's golden section, which places each
+vertex at 0.618 of its edge. HD95 is the 95th percentile of the distances to the surface of T-MC."""
 
 _TIMES = """## Paper B, time
 
@@ -73,7 +73,7 @@ _SSIM = """## Paper A, SSIM
 
 Paper A compares a picture of the reconstruction with a slice by similarity (SSIM) and mean squared error of the grey
 values (MSE). The paper does not say how its pictures were aligned with the slice. Here, pictures and slice have the
-same size and position, and a window of -200 to 800 HU. The last five rows are controls: pictures that no method made."""
+same size and position, and a window of -200 to 800 HU. The last five rows are controls, which no method made."""
 
 
 def make_page(reports: Mapping[str, Report], growing: Mapping[str, Any] | None, rows: Sequence[PaperFunction]) -> str:
@@ -242,8 +242,8 @@ def _times(reports: Mapping[str, Report], growing: Mapping[str, Any] | None) -> 
             for each in growing["rows"]
         ]  # fmt: skip
         tables += [
-            f"The next table is for I-MC with seeds in some of the vertebrae of the phantom of {SETS['b559'].what}. T-MC "
-            "makes the whole surface. Both start from a volume on the device:",
+            f"The next table is for I-MC with seeds in some of the vertebrae of the phantom of {SETS['b559'].what}. "
+            "T-MC makes the whole surface. Both start from a volume on the device:",
             _table(
                 ("vertebrae with seeds", "cells visited", "cells / cells visited", "time of I-MC / time of T-MC"), rows
             ),
