@@ -99,7 +99,11 @@ def main() -> int:
         for name, words in phantoms.items():
             time_process([sys.executable, "-m", "clrecon", "phantom", name, *words.split()], folder, options.limit)
         rows = {}
-        print("| command | wall s | processor s | memory | peer's | |\n|---|---|---|---|---|---|", flush=True)
+        print(
+            "| command | wall time, s | processor time, s | peak memory | processor time of the peer, s | |\n"
+            "|---|---|---|---|---|---|",
+            flush=True,
+        )
         for name in COMMANDS:
             if options.only in name:
                 rows[name] = time_command(name, scan, folder, options.peers_python, options.limit)
@@ -120,7 +124,8 @@ def time_command(name: str, scan: str, folder: str, peers_python: str, limit_s: 
     why = judge(run, peer)
     other = "-" if peer is None else peer.error or f"{peer.cpu_s:.1f}"
     memory = f"{1e-9 * run.memory_bytes:.2f} GB"
-    print(f"| {name} | {run.wall_s:.1f} | {run.cpu_s:.1f} | {memory} | {other} | {why} |", flush=True)
+    label = COMMANDS[name].replace(" {scan}", "")
+    print(f"| `{label}` | {run.wall_s:.1f} | {run.cpu_s:.1f} | {memory} | {other} | {why} |", flush=True)
     return {**asdict(run), "peer": None if peer is None else asdict(peer), "why": why}
 
 
