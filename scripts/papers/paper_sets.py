@@ -54,7 +54,7 @@ SETS = {
     each.name: each
     for each in (
         PaperSet(
-            name="a", what="512 x 512 x 95", vertebrae=3, phantom=_spine("T6-T8", "0.644531 0.644531 0.8", 95),
+            name="a", what="512 x 512 x 95 voxels", vertebrae=3, phantom=_spine("T6-T8", "0.644531 0.644531 0.8", 95),
             iso_value=200.0, methods=(), paper=True,
         ),
         PaperSet(
