@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Any
 
-from measure import alternate, summarise
+from measure import time_in_turns
 from registry import Job, case
 
 __all__ = ["measure_components"]
@@ -45,13 +44,9 @@ def measure_components(job: Job) -> dict[str, Any]:
     figures: dict[str, Any] = {"ratios": {}, "sides": {}}
     for name, peer in peers.items():
         components[name] = peer()
-        ours, theirs = alternate(
-            lambda: _seconds(lambda: label_components(job.device, triangles, vertices)),
-            lambda peer=peer: _seconds(peer),  # type: ignore[misc]
-            job.pairs,
-            limit_s=job.limit_s / len(peers),
+        figures["sides"][name] = time_in_turns(
+            lambda: label_components(job.device, triangles, vertices), peer, job.pairs, job.limit_s / len(peers)
         )
-        figures["sides"][name] = summarise(ours, theirs)
         figures["ratios"][name] = figures["sides"][name]["ratio"]
     stopwatch = Stopwatch()
     with stopwatch.running(job.device):
@@ -64,9 +59,3 @@ def measure_components(job: Job) -> dict[str, Any]:
         "equal_to_csgraph": bool(np.array_equal(components["clrecon"][1], components["csgraph"][1])),
         "kernel_seconds": dict(stopwatch.by_kernel),
     }
-
-
-def _seconds(run: Callable[[], Any]) -> float:
-    start = time.perf_counter()
-    run()
-    return time.perf_counter() - start

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
-from measure import alternate, busy_seconds, summarise
+from measure import busy_seconds, time_in_turns
 from registry import Job, case
 
 __all__ = ["measure_decimation"]
@@ -38,7 +37,7 @@ def measure_decimation(job: Job) -> dict[str, Any]:
     if find_spec("meshlib") is not None:
         peers["meshlib"] = lambda: _meshlib(mesh, reached)
     times = {
-        name: _in_turns(lambda: clrecon.decimate_mesh(mesh, SHARE, device=job.device), peer, job)
+        name: time_in_turns(lambda: clrecon.decimate_mesh(mesh, SHARE, device=job.device), peer, job.pairs, job.limit_s)
         for name, peer in peers.items()
     }
     results = {"decimate_mesh": small, **{name: peer() for name, peer in peers.items()}}
@@ -73,17 +72,6 @@ def _busy(run: Callable[[], object]) -> float:
     start = busy_seconds()
     run()
     return busy_seconds() - start
-
-
-def _seconds(run: Callable[[], object]) -> float:
-    start = time.perf_counter()
-    run()
-    return time.perf_counter() - start
-
-
-def _in_turns(own: Callable[[], object], peer: Callable[[], object], job: Job) -> dict[str, Any]:
-    sides = alternate(lambda: _seconds(own), lambda: _seconds(peer), job.pairs, limit_s=job.limit_s)
-    return summarise(*sides)
 
 
 def _fast_simplification(mesh: Any, share: float) -> Any:

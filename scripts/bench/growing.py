@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Any
 
-from measure import alternate, summarise
+from measure import time_in_turns
 from registry import Job, case
 
 __all__ = ["measure_growing"]
@@ -34,10 +33,7 @@ def measure_growing(job: Job) -> dict[str, Any]:
     figures: dict[str, Any] = {"ratios": {}, "sides": {}}
 
     def compare(name: str, ours: Callable[[], Any], theirs: Callable[[], Any], rows: int) -> None:
-        taken = alternate(
-            lambda: _seconds(ours), lambda: _seconds(theirs), job.pairs, limit_s=job.limit_s / rows
-        )  # fmt: skip
-        figures["sides"][name] = summarise(*taken)
+        figures["sides"][name] = time_in_turns(ours, theirs, job.pairs, job.limit_s / rows)
         figures["ratios"][name] = figures["sides"][name]["ratio"]
 
     with SurfaceExtractor(resident) as extractor:
@@ -138,9 +134,3 @@ def _nearest(vertices: Any, points: Any) -> Any:
     from scipy.spatial import cKDTree
 
     return vertices[cKDTree(vertices).query(points)[1]]
-
-
-def _seconds(run: Callable[[], Any]) -> float:
-    start = time.perf_counter()
-    run()
-    return time.perf_counter() - start

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
-from measure import alternate, summarise
+from measure import time_in_turns
 from registry import Job, case
 
 __all__ = ["measure_label_masks"]
@@ -41,13 +41,9 @@ def measure_label_masks(job: Job) -> dict[str, Any]:
             }
             for number, mesh in meshes.items()
         ]
-        ours, other = alternate(
-            lambda labels=labels: _seconds(lambda: extract_label_masks(labels, device=job.device)),  # type: ignore[misc]
-            lambda peer=peer: _seconds(peer),  # type: ignore[misc]
-            job.pairs,
-            limit_s=job.limit_s / 2,
+        figures["sides"][name] = time_in_turns(
+            partial(extract_label_masks, labels, device=job.device), peer, job.pairs, job.limit_s / 2
         )
-        figures["sides"][name] = summarise(ours, other)
         figures["ratios"][name] = figures["sides"][name]["ratio"]
         figures[f"seconds_by_kernel_{name}"] = _by_kernel(meshes)
     return figures
@@ -125,9 +121,3 @@ def _by_kernel(meshes: Any) -> dict[str, float]:
         for kernel, spent in mesh.report["kernel_seconds"].items():
             seconds[kernel] = seconds.get(kernel, 0.0) + spent
     return seconds
-
-
-def _seconds(run: Callable[[], Any]) -> float:
-    start = time.perf_counter()
-    run()
-    return time.perf_counter() - start

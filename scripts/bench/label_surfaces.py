@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Any
 
-from measure import alternate, summarise
+from measure import time_in_turns
 from registry import Job, case
 
 __all__ = ["measure_labels"]
@@ -41,13 +40,12 @@ def measure_labels(job: Job) -> dict[str, Any]:
     figures["triangles"] = sum(len(mesh.triangles) for mesh in meshes.values())
     for name, peer in peers.items():
         figures["peer_triangles"][name] = peer()
-        ours, theirs = alternate(
-            lambda: _seconds(lambda: extract_labels(volume, label_map, job.hu, device=job.device)),
-            lambda peer=peer: _seconds(peer),  # type: ignore[misc]
+        figures["sides"][name] = time_in_turns(
+            lambda: extract_labels(volume, label_map, job.hu, device=job.device),
+            peer,
             job.pairs,
-            limit_s=job.limit_s / len(peers),
+            job.limit_s / len(peers),
         )
-        figures["sides"][name] = summarise(ours, theirs)
         figures["ratios"][name] = figures["sides"][name]["ratio"]
     reports = [mesh.report for mesh in meshes.values()]
     figures["seconds_by_part"] = {
@@ -104,9 +102,3 @@ def _peers(volume: Any, labels: Any, hu: float, threads: int) -> dict[str, Calla
         "discrete_flying_edges": lambda: contour_mask(vtkDiscreteFlyingEdges3D),
         "flying_edges_on_blanked_hu": contour_blanked,
     }
-
-
-def _seconds(run: Callable[[], Any]) -> float:
-    start = time.perf_counter()
-    run()
-    return time.perf_counter() - start

@@ -23,8 +23,10 @@ __all__ = [
     "describe_machine",
     "medians",
     "run_program",
+    "seconds_of",
     "spread",
     "summarise",
+    "time_in_turns",
     "write_json",
 ]
 
@@ -95,6 +97,18 @@ def _usage() -> tuple[int, float]:
         return 0, time.process_time()
     usage = resource.getrusage(resource.RUSAGE_SELF)
     return usage.ru_minflt + usage.ru_majflt, usage.ru_utime + usage.ru_stime
+
+
+def seconds_of(run: Callable[[], object]) -> float:
+    """Wall seconds of a call."""
+    start = time.perf_counter()
+    run()
+    return time.perf_counter() - start
+
+
+def time_in_turns(own: Callable[[], object], peer: Callable[[], object], pairs: int, limit_s: float) -> dict[str, Any]:
+    """Time a function and its peer in turn, see `alternate`, and return `summarise` of both."""
+    return summarise(*alternate(lambda: seconds_of(own), lambda: seconds_of(peer), pairs, limit_s=limit_s))
 
 
 def busy_seconds() -> float:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from typing import Any
 
-from measure import alternate, summarise
+from measure import seconds_of, time_in_turns
 from registry import Job, case
 
 __all__ = ["measure_refinement"]
@@ -28,18 +26,19 @@ def measure_refinement(job: Job) -> dict[str, Any]:
     small = clrecon.decimate_mesh(mesh, SHARE, device=job.device)
     reached = small.report["refinement"]["decimate"]["reached"]
     peer_small = _decimate(mesh, reached)
+    how = job.pairs, job.limit_s
     times = {
-        "smooth": _in_turns(lambda: clrecon.smooth_mesh(mesh, device=job.device), lambda: _smooth(mesh), job),
-        "decimate": _in_turns(
-            lambda: clrecon.decimate_mesh(mesh, SHARE, device=job.device), lambda: _decimate(mesh, reached), job
+        "smooth": time_in_turns(lambda: clrecon.smooth_mesh(mesh, device=job.device), lambda: _smooth(mesh), *how),
+        "decimate": time_in_turns(
+            lambda: clrecon.decimate_mesh(mesh, SHARE, device=job.device), lambda: _decimate(mesh, reached), *how
         ),
-        "quality": _in_turns(mesh.quality, lambda: _measure(mesh), job),
+        "quality": time_in_turns(mesh.quality, lambda: _measure(mesh), *how),
     }
     return {
         "ratios": {name: found["ratio"] for name, found in times.items()},
         "triangles": mesh.triangle_count,
         **times,
-        "compare_s": _seconds(lambda: clrecon.compare_meshes(small, mesh)),
+        "compare_s": seconds_of(lambda: clrecon.compare_meshes(small, mesh)),
         "results": {
             "clrecon": {"reached": reached, **_judge(small, mesh)},
             "peer": {"reached": 1.0 - peer_small.triangle_count / mesh.triangle_count, **_judge(peer_small, mesh)},
@@ -53,17 +52,6 @@ def _judge(small: Any, mesh: Any) -> dict[str, Any]:
     quality, deviation = small.quality(), clrecon.compare_meshes(small, mesh)
     facts = {name: quality[name] for name in ("closed", "manifold", "components", "nonmanifold_edges")}
     return {**facts, **{name: deviation[name] for name in ("hd95_mm", "assd_mm", "max_mm", "volume_change_percent")}}
-
-
-def _seconds(run: Callable[[], object]) -> float:
-    start = time.perf_counter()
-    run()
-    return time.perf_counter() - start
-
-
-def _in_turns(own: Callable[[], object], peer: Callable[[], object], job: Job) -> dict[str, Any]:
-    sides = alternate(lambda: _seconds(own), lambda: _seconds(peer), job.pairs, limit_s=job.limit_s)
-    return summarise(*sides)
 
 
 def _smooth(mesh: Any) -> None:

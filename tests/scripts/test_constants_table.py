@@ -56,15 +56,14 @@ WITH_LENGTHS = {row.module for row in ROWS if row.units != {"HU"}}
 WITH_VALUES = {row.module for row in ROWS if "HU" in row.units}
 
 
-@pytest.mark.parametrize("row", ROWS, ids=lambda row: row.module)
-def test_row_of_constants_says_what_values_follow_exactly_if_one_is_in_hu(row: Row) -> None:
-    assert ("values:" in row.follows) == ("HU" in row.units)
+def test_rows_of_constants_say_what_values_follow_exactly_where_one_is_in_hu() -> None:
+    assert [row.module for row in ROWS if ("values:" in row.follows) != ("HU" in row.units)] == []
 
 
-@pytest.mark.parametrize("row", ROWS, ids=lambda row: row.module)
-def test_row_of_constants_says_what_lengths_follow_exactly_if_one_is_not_in_hu(row: Row) -> None:
-    says_lengths = any(word in row.follows for word in ("voxel", "object", "files", "nothing"))
-    assert says_lengths == (row.units != {"HU"})
+def test_rows_of_constants_say_what_lengths_follow_exactly_where_one_is_not_in_hu() -> None:
+    words = ("voxel", "object", "files", "nothing")
+    says_lengths = [any(word in row.follows for word in words) for row in ROWS]
+    assert says_lengths == [row.units != {"HU"} for row in ROWS]
 
 
 def test_modules_of_which_lengths_or_values_are_explained_are_those_with_such_constants() -> None:
@@ -78,10 +77,10 @@ def test_modules_whose_constants_are_said_to_follow_the_scan_have_a_test_that_sh
     assert set(make_constants_table.SHOWN_BY) == following | set(make_constants_table.VALUES)
 
 
-@pytest.mark.parametrize("place", sorted(set(make_constants_table.SHOWN_BY.values())))
-def test_test_that_shows_what_constants_follow_exists(place: str) -> None:
-    file, name = place.split("::")
-    assert f"def {name}(" in (ROOT / "tests" / file).read_text(encoding="utf-8")
+def test_tests_that_show_what_constants_follow_exist() -> None:
+    places = [place.split("::") for place in sorted(set(make_constants_table.SHOWN_BY.values()))]
+    texts = {file: (ROOT / "tests" / file).read_text(encoding="utf-8") for file, _ in places}
+    assert [name for file, name in places if f"def {name}(" not in texts[file]] == []
 
 
 def test_module_with_constants_that_is_not_explained_is_refused_by_name(tmp_path: Path) -> None:

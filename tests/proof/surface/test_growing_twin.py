@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from surface_volumes import smooth_volume
 
-from clrecon.proof.surface.case_table import EDGES, case_table
 from clrecon.proof.surface.growing import (
     choose_largest,
     count_visited,
@@ -102,12 +101,6 @@ def test_cells_beside_a_crossed_edge_belong_to_one_component() -> None:
     around = np.array([numbers[k : k + 2, j : j + 2, i].ravel() for k, j, i in crossed_edges])
     assert (around == around[:, :1]).all()
     assert around.min() >= 0
-
-
-@pytest.mark.parametrize("case", range(256))
-def test_corners_of_the_triangles_of_a_case_lie_on_its_crossed_edges_and_on_each_of_them(case: int) -> None:
-    crossed = {number for number, (_, low, high) in enumerate(EDGES) if (case >> low & 1) != (case >> high & 1)}
-    assert {edge for triangle in case_table()[case] for edge in triangle} == crossed
 
 
 @pytest.mark.parametrize(
