@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -121,76 +122,76 @@ def test_cloud_of_two_levels_is_refused_before_any_case(cohort: Path, tmp_path: 
 
 
 @dataclass
-class PartialBatch:
-    """Three balls and a case without a scan, of which the first two were made; then the mesh of A was cut off."""
+class Batch:
+    """A folder with a manifest of four cases, and its output."""
 
     folder: Path
 
-    def run(self, *options: str, hu: str = "0") -> None:
-        assert main(["batch", str(self.folder / "m.csv"), "-o", str(self.folder / "out"), "--hu", hu, *options]) == 8
+    def run(self, *options: str, hu: str = "0") -> int:
+        return main(["batch", str(self.folder / "m.csv"), "-o", str(self.folder / "out"), "--hu", hu, *options])
 
 
 @pytest.fixture
-def partial_batch(tmp_path: Path) -> PartialBatch:
-    batch = PartialBatch(write_cohort(tmp_path))
-    batch.run("--part", "1/2", "-q")  # A and the case that is gone
-    (tmp_path / "out" / "A" / "mesh.stl").write_bytes(b"cut")
-    return batch
+def whole_batch(cohort: Path, tmp_path: Path) -> Batch:
+    """Three balls that were made, and a case without a scan."""
+    return Batch(shutil.copytree(cohort, tmp_path / "cohort"))
 
 
 @pytest.mark.seconds
-def test_part_of_a_batch_writes_its_cases_and_no_table(partial_batch: PartialBatch) -> None:
-    assert sorted(path.name for path in (partial_batch.folder / "out").iterdir()) == ["A", "gone"]
+def test_part_of_a_batch_writes_its_cases_and_no_table(tmp_path: Path) -> None:
+    batch = Batch(write_cohort(tmp_path))
+
+    assert batch.run("--part", "1/2", "--no-picture", "-q") == 8
+
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["A", "gone"]
 
 
 @pytest.mark.seconds
 def test_resume_makes_missing_and_changed_cases_and_ends_with_the_files_of_a_whole_run(
-    cohort: Path, partial_batch: PartialBatch, printed: Any
+    whole_batch: Batch, printed: Any
 ) -> None:
+    output = whole_batch.folder / "out"
+    whole = {name: data for name, data in files_of(output).items() if name.endswith((".stl", ".png"))}
+    assert len(whole) == 2 * 3  # a mesh and a picture of each ball
+    shutil.rmtree(output / "B")
+    (output / "A" / "mesh.stl").write_bytes(b"cut")
     printed()
-    partial_batch.run("--resume", "--json")
+
+    assert whole_batch.run("--resume", "--json") == 8
 
     report = printed().report()
-    assert (report["cases"], report["made"], report["kept"]) == (4, 4, 0)  # the case that is gone is tried again
-    whole = {name: data for name, data in files_of(cohort / "out").items() if name.endswith((".stl", ".png"))}
-    assert len(whole) == 2 * 3  # a mesh and a picture of each ball
-    resumed = files_of(partial_batch.folder / "out")
+    assert (report["cases"], report["made"], report["kept"]) == (4, 3, 1)  # the case that is gone is tried again
+    resumed = files_of(output)
     assert {name: resumed[name] for name in whole} == whole
 
 
 @pytest.mark.seconds
-def test_resume_of_a_whole_batch_keeps_its_cases_and_tries_refused_ones_again(
-    partial_batch: PartialBatch, printed: Any
-) -> None:
-    partial_batch.run("--resume", "-q")
+def test_resume_of_a_whole_batch_keeps_its_cases_and_tries_refused_ones_again(whole_batch: Batch, printed: Any) -> None:
     printed()
 
-    partial_batch.run("--resume", "--json")
+    assert whole_batch.run("--resume", "--json") == 8
 
     report = printed().report()
     assert (report["made"], report["kept"], report["statuses"]) == (1, 3, {"done": 3, "refused": 1})
 
 
 @pytest.mark.seconds
-def test_resume_with_another_setting_makes_all_cases(partial_batch: PartialBatch, printed: Any) -> None:
-    partial_batch.run("--resume", "-q")
+def test_resume_with_another_setting_makes_all_cases(whole_batch: Batch, printed: Any) -> None:
     printed()
 
-    partial_batch.run("--resume", "--json", hu="250")
+    assert whole_batch.run("--resume", "--json", hu="250") == 8
 
     assert printed().report()["kept"] == 0
 
 
 @pytest.mark.seconds
-def test_retry_makes_refused_cases_again_and_leaves_done_ones_as_they_are(tmp_path: Path, printed: Any) -> None:
-    folder = write_cohort(tmp_path)
-    command = ["batch", str(folder / "m.csv"), "-o", str(folder / "out"), "--no-picture", "--no-measure"]
-    assert main([*command, "--hu", "300", "-q"]) == 8
+def test_retry_makes_refused_cases_again_and_leaves_done_ones_as_they_are(whole_batch: Batch, printed: Any) -> None:
+    folder = whole_batch.folder
     before = files_of(folder / "out" / "A")
     (folder / "ball1").rename(folder / "ball4")  # the scan of the case that was gone
     printed()
 
-    assert main([*command, "--hu", "400", "--retry", "--json"]) == 0
+    assert whole_batch.run("--retry", "--json", hu="400") == 0
 
     report = printed().report()
     assert (report["made"], report["kept"], report["statuses"]) == (1, 3, {"done": 4})

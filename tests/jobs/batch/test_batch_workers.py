@@ -37,10 +37,10 @@ def write_manifest(folder: Path, inputs: Mapping[str, str]) -> None:
 
 
 @pytest.fixture
-def forty_cases(tmp_path: Path) -> list[str]:
+def small_cases(tmp_path: Path) -> list[str]:
     """Names of so many small cases that none of these tests meets the last one."""
     write_ball(tmp_path / "small", 24)
-    names = [f"case{number}" for number in range(40)]
+    names = [f"case{number}" for number in range(12)]
     write_manifest(tmp_path, dict.fromkeys(names, "small"))
     return names
 
@@ -58,10 +58,10 @@ def statuses(folder: Path) -> dict[str, str]:
 
 
 def test_case_of_a_killed_worker_is_lost_alone_and_named_with_the_signal_and_resume_makes_it(
-    tmp_path: Path, forty_cases: list[str]
+    tmp_path: Path, small_cases: list[str]
 ) -> None:
     process = start(tmp_path)
-    first_case = tmp_path / "out" / forty_cases[0]
+    first_case = tmp_path / "out" / small_cases[0]
     wait_until(process, first_case.exists)  # no kernel is built any more, whose file could be cut
     (worker,) = children_of(process.pid)
     os.kill(worker, signal.SIGKILL)
@@ -70,7 +70,7 @@ def test_case_of_a_killed_worker_is_lost_alone_and_named_with_the_signal_and_res
     assert process.returncode == 8
     found = statuses(tmp_path)
     (lost,) = (case for case, status in found.items() if status == "lost")
-    assert found == dict.fromkeys(forty_cases, "done") | {lost: "lost"}
+    assert found == dict.fromkeys(small_cases, "done") | {lost: "lost"}
     assert lost in errors and "SIGKILL" in errors
     report = json.loads((tmp_path / "out" / lost / "case.json").read_text())
     assert "SIGKILL" in report["error"]["message"]
@@ -78,7 +78,7 @@ def test_case_of_a_killed_worker_is_lost_alone_and_named_with_the_signal_and_res
     again = start(tmp_path, "--resume", "--json")
     resumed = json.loads(again.communicate(timeout=240)[0])
     assert again.returncode == 0
-    assert (resumed["made"], resumed["kept"]) == (1, len(forty_cases) - 1)
+    assert (resumed["made"], resumed["kept"]) == (1, len(small_cases) - 1)
 
 
 def test_case_of_a_killed_worker_among_several_is_made_again_alone(tmp_path: Path) -> None:
@@ -94,14 +94,14 @@ def test_case_of_a_killed_worker_among_several_is_made_again_alone(tmp_path: Pat
     assert statuses(tmp_path) == dict.fromkeys(cases, "done")
 
 
-def test_interrupted_batch_ends_with_130_and_leaves_only_whole_cases(tmp_path: Path, forty_cases: list[str]) -> None:
+def test_interrupted_batch_ends_with_130_and_leaves_only_whole_cases(tmp_path: Path, small_cases: list[str]) -> None:
     process = start(tmp_path)
-    wait_until(process, (tmp_path / "out" / forty_cases[0]).exists)
+    wait_until(process, (tmp_path / "out" / small_cases[0]).exists)
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 130 and "Traceback" not in errors
-    left = sorted((tmp_path / "out").iterdir(), key=lambda folder: forty_cases.index(folder.name))
-    assert [folder.name for folder in left] == forty_cases[: len(left)] and len(left) < len(forty_cases)
+    left = sorted((tmp_path / "out").iterdir(), key=lambda folder: small_cases.index(folder.name))
+    assert [folder.name for folder in left] == small_cases[: len(left)] and len(left) < len(small_cases)
     assert all((folder / "mesh.stl").is_file() and (folder / "case.json").is_file() for folder in left)
 
 
