@@ -14,8 +14,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TextIO
 
-__all__ = ["ROOT", "SetupError", "ensure_environment", "find_python", "program_path"]
-
 ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 _TICK_SECONDS = 1.0
 _LINE_SECONDS = 15.0
@@ -70,23 +68,12 @@ def ensure_environment(
 ) -> str:
     """Return the folder of a finished environment; make it if it is missing.
 
-    Parameters
-    ----------
-    name : str
-        Folder in the project, such as ``.venv``.
-    extras : str
-        Extras of setup.cfg to install, such as ``test,dev``.
-    program : str
-        A program of the finished environment.
-    compiled : bool
-        Whether pip compiles all modules, half a minute for the tests' ten thousand; else each is at its first import.
-    megabytes : int
-        Size of the finished environment on the disk, for messages; 0: not said.
-
-    Raises
-    ------
-    SetupError
-        There is no venv module, writing is not permitted, or pip failed.
+    name: Folder in the project, such as ``.venv``.
+    extras: Extras of setup.cfg to install, such as ``test,dev``.
+    program: A program of the finished environment.
+    compiled: Whether pip compiles all modules, half a minute for the tests' ten thousand; else each is at its first
+    import.
+    megabytes: Size of the finished environment on the disk, for messages; 0: not said.
     """
     folder = os.path.join(ROOT, name)
     stamp = _wanted_stamp(extras)

@@ -10,8 +10,6 @@ from typing import Any
 from measure import alternate, busy_seconds, summarise
 from registry import Job, case
 
-__all__ = ["measure_bilateral"]
-
 PEER_SLICES = 4
 """Slices that ITK filters: its time is that of all, per voxel.  It takes half a minute for 40 million voxels."""
 

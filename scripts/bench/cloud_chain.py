@@ -12,8 +12,6 @@ from measure import medians, run_program
 from registry import HERE, Job, case
 from wall_and_cpu import alternate_twice
 
-__all__ = ["measure_cloud_chain"]
-
 BAND = (200.0, 3000.0)
 EPS_MM, FEWEST = 1.2, 6
 CLUSTERERS = ("sklearn", "open3d")

@@ -8,18 +8,13 @@ from typing import Any
 from results import Key
 from tables import markdown
 
-__all__ = ["Change", "compare_results", "format_changes"]
-
 
 @dataclass(frozen=True)
 class Change:
     """One ratio of one result, before and now.
 
-    Attributes
-    ----------
-    fell : bool
-        True for a loss that neither spread explains: the new median lies more than the allowed share below the lower
-        quartile of the baseline, and the new upper quartile lies below the baseline's median.
+    fell: True for a loss that neither spread explains: the new median lies more than the allowed share below the lower
+    quartile of the baseline, and the new upper quartile lies below the baseline's median.
     """
 
     key: Key
@@ -44,18 +39,9 @@ def compare_results(
 ) -> tuple[list[Change], list[str]]:
     """Compare the ratios that both sides have.
 
-    Parameters
-    ----------
-    baseline, new : dict
-        Results from `results.load_results`.
-    percent : float
-        Allowed fall of a ratio below the spread of the baseline.
-
-    Returns
-    -------
-    changes : list of Change
-    left_out : list of str
-        Descriptions of results that only one side has.
+    baseline, new: Results from `results.load_results`.
+    percent: Allowed fall of a ratio below the spread of the baseline.
+    left_out: Descriptions of results that only one side has.
     """
     changes, left_out = [], []
     for key in sorted({*baseline, *new}):

@@ -8,8 +8,6 @@ from typing import Any
 from measure import time_in_turns
 from registry import Job, case
 
-__all__ = ["measure_components"]
-
 
 @case("components", "components of the surface on the device, against scipy and cc3d")
 def measure_components(job: Job) -> dict[str, Any]:

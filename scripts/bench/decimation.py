@@ -10,8 +10,6 @@ from typing import Any
 from measure import busy_seconds, time_in_turns
 from registry import Job, case
 
-__all__ = ["measure_decimation"]
-
 SHARE = 0.9
 """Share of the triangles to remove."""
 

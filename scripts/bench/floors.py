@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 
 from clrecon.proof.timing import usable_cores
 
-__all__ = ["active_brick_share", "copy_bandwidth", "floor_bytes", "kernel_bytes", "share_of_floor", "usable_bandwidth"]
-
 BRICK = 8
 _COPY_BYTES = 1 << 28
 

@@ -7,8 +7,6 @@ from typing import Any
 from registry import Job, case
 from wall_and_cpu import alternate_twice
 
-__all__ = ["measure_sort", "measure_surface_clusters", "measure_voxel_clusters"]
-
 EPS_MM = 1.2
 MIN_SAMPLES = 6
 

@@ -8,8 +8,6 @@ from typing import Any
 from measure import time_in_turns
 from registry import Job, case
 
-__all__ = ["measure_growing"]
-
 
 @case("growing", "surfaces grown from seeds (I-MC), against the whole (T-MC), T-MC with a choice after it, and cc3d")
 def measure_growing(job: Job) -> dict[str, Any]:

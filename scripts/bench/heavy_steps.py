@@ -11,8 +11,6 @@ from measure import busy_seconds, spread
 from registry import Job, case
 from wall_and_cpu import alternate_twice
 
-__all__ = ["measure_canal", "measure_crossings", "measure_fitted", "measure_table"]
-
 
 @case("canal", "search for the spinal canal: seconds, processor seconds and memory above the scan; it has no peer")
 def measure_canal(job: Job) -> dict[str, Any]:

@@ -24,8 +24,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["BenchInput", "parse_input"]
-
 _MADE_UP = re.compile(r"(spine|clean|ties|thick|cube|noise)(\d+)")
 _SIZE = 512
 
@@ -72,13 +70,7 @@ class BenchInput:
         return np.load(kept)
 
     def ct_folder(self) -> Path:
-        """The input as a folder of CT slices.
-
-        Raises
-        ------
-        UsageError
-            Only phantoms of the spine are written as DICOM.
-        """
+        """The input as a folder of CT slices."""
         from clrecon.errors import UsageError
 
         if self.folder is not None:
@@ -149,13 +141,7 @@ def _phantom_settings(name: str) -> Any:
 
 
 def parse_input(text: str, work: Path) -> BenchInput:
-    """Read one ``--input``.
-
-    Raises
-    ------
-    UsageError
-        The text is neither a synthetic input nor a folder.
-    """
+    """Read one ``--input``."""
     from clrecon.errors import UsageError
 
     if _MADE_UP.fullmatch(text):

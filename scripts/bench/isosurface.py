@@ -11,8 +11,6 @@ from floors import active_brick_share, copy_bandwidth, floor_bytes, kernel_bytes
 from measure import Costs, alternate, medians, spread, summarise
 from registry import Job, case
 
-__all__ = ["LEVEL_STEPS", "OwnSide", "PeerSide", "measure_cold", "measure_resident"]
-
 LEVEL_STEPS = (0, 150, 40, 250, 80, 300, 20)
 """Steps of `isosurface-resident`, HU above the iso value; every round starts one HU higher.
 

@@ -9,8 +9,6 @@ from typing import Any
 from measure import time_in_turns
 from registry import Job, case
 
-__all__ = ["measure_label_masks"]
-
 ROUNDS = 16
 AIR_HU = -400
 

@@ -8,8 +8,6 @@ from typing import Any
 from measure import time_in_turns
 from registry import Job, case
 
-__all__ = ["measure_labels"]
-
 LABELS = 8
 
 

@@ -49,11 +49,6 @@ def run_program(command: Sequence[str], timeout_s: float = 600.0) -> tuple[float
 
     Python keeps what it compiles, as pip does when it installs a program, whatever the environment says: else each
     process compiles this folder anew.
-
-    Raises
-    ------
-    RuntimeError
-        The program fails or takes longer than `timeout_s`.
     """
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))}
     environment.pop("PYTHONDONTWRITEBYTECODE", None)

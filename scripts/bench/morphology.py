@@ -9,8 +9,6 @@ from typing import Any
 from registry import Job, case
 from voxel_clusters import compare_sides
 
-__all__ = ["measure_morphology"]
-
 RADIUS_MM, LARGE_MM = 3.0, 8.0
 SCIPY_SLICES = 20
 """Slices that scipy dilates, as do we beside it: it takes a minute for 150."""

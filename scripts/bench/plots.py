@@ -7,20 +7,12 @@ from typing import Any
 
 from results import Key
 
-__all__ = ["plot_ratios", "plot_scaling"]
-
 OWN, PEER, GOOD, BAD = "#1f5fa8", "#b5651d", "#1f5fa8", "#b03030"
 _UNITS = {"voxels": (1e-6, "million voxels"), "triangles": (1e-6, "million triangles")}
 
 
 def plot_ratios(results: dict[Key, dict[str, Any]], path: Path) -> int:
-    """Draw one bar per ratio with its quartiles, grouped by case; returns the number of bars.
-
-    Raises
-    ------
-    ValueError
-        There is no ratio to draw.
-    """
+    """Draw one bar per ratio with its quartiles, grouped by case; returns the number of bars."""
     from matplotlib.figure import Figure
 
     bars: list[tuple[str, dict[str, float]]] = []

@@ -9,8 +9,6 @@ from typing import Any
 from measure import spread
 from registry import Job, case
 
-__all__ = ["measure_fields"]
-
 SPACINGS_MM = (0.65, 1.0)
 BRIDGE = 1.5
 """B = R in spacings: enough for vertices of a surface in voxels of that size."""

@@ -14,8 +14,6 @@ from typing import Any
 from measure import alternate, summarise
 from registry import Job, case
 
-__all__ = ["measure_filter", "measure_neighbours", "measure_normals", "measure_outliers"]
-
 K = 16
 THREADS = 2
 CLOUDS = {"voxels500": 500.0, "surface": None, "voxels200": 200.0, "voxels60": 60.0}

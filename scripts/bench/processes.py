@@ -11,8 +11,6 @@ from typing import Any
 from measure import alternate, medians, run_program, spread, summarise
 from registry import HERE, Job, case
 
-__all__ = ["measure_first_call", "measure_main_job", "measure_memory"]
-
 
 class Child:
     """Runs of child.py, with their outputs."""

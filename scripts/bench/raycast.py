@@ -11,8 +11,6 @@ from typing import Any
 from measure import Costs, alternate, medians, spread, summarise
 from registry import Job, case
 
-__all__ = ["Shot", "make_shots", "measure_first", "measure_gpu_mapper", "measure_warm"]
-
 SIZE = (1024, 1024)
 ZOOM = 1.0
 """Zoom of all pictures, the default of `Camera.fit`."""

@@ -16,8 +16,6 @@ from measure import alternate, run_program, spread, summarise
 from registry import HERE, Job, case
 from trees import write_tree
 
-__all__ = ["measure_reading", "measure_scan_tree"]
-
 READ_SERIES = HERE / "peers" / "read_series.py"
 TREES = ((100, 10), (1_000, 10), (10_000, 10))
 """Series and slices of each: 1,000, 10,000 and 100,000 files."""

@@ -7,8 +7,6 @@ from typing import Any
 from measure import seconds_of, time_in_turns
 from registry import Job, case
 
-__all__ = ["measure_refinement"]
-
 SHARE = 0.9
 """Share of the triangles to remove."""
 

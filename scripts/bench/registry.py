@@ -16,8 +16,6 @@ from typing import Any
 
 from inputs import BenchInput
 
-__all__ = ["CASES", "Case", "Job", "case", "load_cases"]
-
 HERE = Path(__file__).resolve().parent
 
 
@@ -25,21 +23,12 @@ HERE = Path(__file__).resolve().parent
 class Job:
     """Input, device and limits of one run of a case.
 
-    Attributes
-    ----------
-    input : BenchInput
-        ``input.volume()`` in memory, ``input.ct_folder()`` as DICOM, ``input.arrays()`` as .npy files.
-    hu : float
-        Iso value.
-    pairs : int
-        Timed pairs of clrecon and peer.
-    device : clrecon.opencl.Device
-    peer_threads : int
-        Threads of VTK's flying edges.
-    limit_s : float
-        Start no further pair after so many seconds; for `clrecon.proof.timing.alternate`.
-    pictures : Path or None
-        Folder where cases that draw keep what both sides drew.
+    input: ``input.volume()`` in memory, ``input.ct_folder()`` as DICOM, ``input.arrays()`` as .npy files.
+    hu: Iso value.
+    pairs: Timed pairs of clrecon and peer.
+    peer_threads: Threads of VTK's flying edges.
+    limit_s: Start no further pair after so many seconds; for `clrecon.proof.timing.alternate`.
+    pictures: Folder where cases that draw keep what both sides drew.
     """
 
     input: BenchInput

@@ -8,8 +8,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-__all__ = ["SCHEMA", "Key", "device_name", "load_results", "pick", "result_key", "result_path"]
-
 SCHEMA = 1
 
 Key = tuple[str, str, str]
@@ -35,13 +33,7 @@ def result_path(folder: Path, result: dict[str, Any]) -> Path:
 
 
 def load_results(folder: Path) -> dict[Key, dict[str, Any]]:
-    """Load all results of a folder by key; other files are named on stderr and skipped.
-
-    Raises
-    ------
-    FileNotFoundError
-        There is no such folder.
-    """
+    """Load all results of a folder by key; other files are named on stderr and skipped."""
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder} is not a folder of results")
     results = {}

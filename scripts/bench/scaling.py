@@ -15,8 +15,6 @@ from registry import Job, case
 
 from clrecon.proof.timing import FEWEST_PAIRS
 
-__all__ = ["choose_levels", "choose_slices", "estimate_triangles", "fit_line", "measure_scaling"]
-
 FEWEST_SLICES = 64
 POINTS = 8
 MOST_TRIANGLES = 12_000_000
@@ -26,10 +24,7 @@ PAIRS_A_POINT = 7
 def fit_line(x: Sequence[float], y: Sequence[float]) -> dict[str, float]:
     """Least squares y = intercept + slope x, and the share of the variance that the line explains.
 
-    Returns
-    -------
-    dict
-        ``slope, intercept, r2``; r2 is 1 for equal y.
+    Returns ``slope, intercept, r2``; r2 is 1 for equal y.
     """
     slope, intercept = np.polyfit(x, y, 1)
     rest = np.asarray(y) - (intercept + slope * np.asarray(x))

@@ -7,8 +7,6 @@ from typing import Any
 
 from results import Key
 
-__all__ = ["format_results", "markdown"]
-
 
 def markdown(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     """Lay out a table with columns of even width."""

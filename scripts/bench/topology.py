@@ -8,8 +8,6 @@ from typing import Any
 from measure import alternate, summarise
 from registry import Job, case
 
-__all__ = ["measure_topology"]
-
 
 @case("topology", "surfaces with the topology of the trilinear field, against the default's")
 def measure_topology(job: Job) -> dict[str, Any]:

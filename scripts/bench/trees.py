@@ -5,8 +5,6 @@ from __future__ import annotations
 import io
 from pathlib import Path
 
-__all__ = ["write_tree"]
-
 _SERIES, _SLICE = 77_777_777, 55_555_555
 """Numbers in the template that are replaced in every file; eight digits each, so that no length changes."""
 GAP_MM = 1.5

@@ -11,8 +11,6 @@ from measure import alternate, summarise
 from raycast import keep_pictures, likeness
 from registry import Job, case
 
-__all__ = ["measure_triangles"]
-
 SIZES = (512, 1024)
 
 

@@ -11,8 +11,6 @@ from typing import Any
 from measure import busy_seconds, run_program, spread
 from registry import Job, case
 
-__all__ = ["measure_first_picture", "measure_picks", "measure_view"]
-
 SIDE, SHARP_SIDE, SLICE_SIDE = 512, 1024, 400
 PICKS = 2000
 PATIENCE_S = 120.0

@@ -17,8 +17,6 @@ from typing import Any
 from measure import spread
 from registry import Job, case
 
-__all__ = ["measure_view_web"]
-
 WINDOW = (1100, 800)
 """Pixels of the browser; the picture is somewhat smaller and said in the result."""
 

@@ -10,8 +10,6 @@ from typing import Any
 from measure import alternate, spread, summarise
 from registry import Job, case
 
-__all__ = ["BANDS", "compare_sides", "measure_voxel_clusters"]
-
 EPS_MM, MIN_SAMPLES = 1.2, 6
 BANDS = {"T15": 500.0, "T1": 200.0, "T4": 60.0}
 """Lowest HU of the clouds, by the names of the design."""

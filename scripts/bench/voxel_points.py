@@ -8,8 +8,6 @@ from typing import Any
 from registry import Job, case
 from voxel_clusters import BANDS, compare_sides
 
-__all__ = ["measure_voxel_points"]
-
 
 @case(
     "voxel-points", "voxels of a band as a cloud, against numpy: nonzero and a matrix, one axis at a time, all voxels"

@@ -8,19 +8,14 @@ from typing import Any
 
 from measure import alternate, busy_seconds, summarise
 
-__all__ = ["alternate_twice"]
-
 
 def alternate_twice(
     candidate: Callable[[], Any], peer: Callable[[], Any], pairs: int, limit_s: float | None = None
 ) -> dict[str, dict[str, Any]]:
     """Run two functions in turn, once untimed first.
 
-    Returns
-    -------
-    dict
-        ``wall`` and ``cpu``, each as `summarise` gives it.  Idle threads of OpenBLAS count as processor time, and slow
-        whatever comes next: set OPENBLAS_NUM_THREADS=1.
+    Returns ``wall`` and ``cpu``, each as `summarise` gives it.  Idle threads of OpenBLAS count as processor time, and
+    slow whatever comes next: set OPENBLAS_NUM_THREADS=1.
     """
     cpu: dict[str, list[float]] = {"ours": [], "theirs": []}
 

@@ -79,13 +79,7 @@ def programs(peers_python: str, threads: int) -> list[Program]:
 
 
 def run_once(program: Program, folder: Path, output: Path, *, watch: bool) -> tuple[float, int | None]:
-    """Run a program; returns wall seconds and, watched, the peak of the memory of all its processes in bytes.
-
-    Raises
-    ------
-    RuntimeError
-        It fails, takes too long, or writes nothing.
-    """
+    """Run a program; returns wall seconds and, watched, the peak of the memory of all its processes in bytes."""
     output.unlink(missing_ok=True)
     words = {"IN": str(folder), "OUT": str(output)}
     command = [words.get(part, part) for part in program.command]

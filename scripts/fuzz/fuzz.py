@@ -191,11 +191,7 @@ class Campaign:
 class Schedule:
     """Which case comes next: of the family that has had the least of its share of the time.
 
-    Attributes
-    ----------
-    families : sequence of str
-    most : int
-        Number of cases after which there is none.
+    most: Number of cases after which there is none.
     """
 
     families: Sequence[str]
@@ -242,20 +238,9 @@ def run_campaign(
 ) -> Campaign:
     """Run cases in `jobs` processes until the time or the cases are over.
 
-    Parameters
-    ----------
-    schedule : Schedule or NamedCases
-    seconds : float
-        Time after which no case is begun.
-    seed : str
-        Without spaces.
-    jobs : int
-    start_worker : callable
-        Starts a process with a case and the seed.
-
-    Returns
-    -------
-    Campaign
+    seconds: Time after which no case is begun.
+    seed: Without spaces.
+    start_worker: Starts a process with a case and the seed.
     """
     campaign, start = Campaign(), time.monotonic()
     workers: list[Worker] = []

@@ -55,19 +55,11 @@ class Answer:
 class Trial:
     """One harmed input.
 
-    Attributes
-    ----------
-    words : str
-        What was harmed, and how.
-    run : callable
-        Reads it; raises what clrecon raises.
-    unharmed : Answer
-        The answer without harm.
-    contradicted : callable
-        Given the answer, True if its difference to `unharmed` needs a warning.
-    limit_s : float
-        Of processor time.
-    limit_bytes : int
+    words: What was harmed, and how.
+    run: Reads it; raises what clrecon raises.
+    unharmed: The answer without harm.
+    contradicted: Given the answer, True if its difference to `unharmed` needs a warning.
+    limit_s: Of processor time.
     """
 
     words: str

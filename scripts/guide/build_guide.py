@@ -29,15 +29,8 @@ def find_missing() -> list[str]:
 def build_guide(folder: Path) -> int:
     """Build the site.
 
-    Parameters
-    ----------
-    folder : Path
-        Where it goes; what is there from an earlier build is written over.
-
-    Returns
-    -------
-    int
-        0, or what Sphinx gave: a warning is an error.
+    folder: Where it goes; what is there from an earlier build is written over.
+    Returns 0, or what Sphinx gave: a warning is an error.
     """
     from sphinx.cmd.build import main as sphinx_build
 

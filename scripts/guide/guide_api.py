@@ -7,8 +7,6 @@ from typing import Any
 
 import clrecon
 
-__all__ = ["SUBJECTS", "names_by_subject", "write_api"]
-
 SUBJECTS = {
     "volumes": ("Volumes: read, cut, write", "clrecon.reading clrecon.geometry clrecon.operators.resident"),
     "surfaces": ("Surfaces", "clrecon.operators.surface clrecon.anatomy.iso_choice"),
@@ -54,13 +52,7 @@ def _subject_of(module: str) -> str | None:
 
 
 def names_by_subject() -> dict[str, list[str]]:
-    """Return the public names of each page, in the order of the alphabet.
-
-    Raises
-    ------
-    ValueError
-        A public name comes from a module that no page has.
-    """
+    """Return the public names of each page, in the order of the alphabet."""
     pages: dict[str, list[str]] = {page: [] for page in SUBJECTS}
     package: Any = clrecon  # whose stub says the public names alone
     for name, (module, _) in package._homes.items():

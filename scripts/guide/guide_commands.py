@@ -8,8 +8,6 @@ from importlib import import_module
 from clrecon.cli.common import Parser, add_common
 from clrecon.cli.main import COMMANDS
 
-__all__ = ["command_parser", "describe_options"]
-
 
 def command_parser(command: str) -> Parser:
     """Return the parser of a command, with the options that all commands have."""
@@ -31,15 +29,8 @@ def _name_of(action: argparse.Action, formatter: argparse.HelpFormatter) -> str:
 def describe_options(command: str) -> str:
     """Return the options of a command as Markdown: a list of definitions for each group.
 
-    Parameters
-    ----------
-    command : str
-        A key of `clrecon.cli.main.COMMANDS`.
-
-    Returns
-    -------
-    str
-        From the heading on.
+    command: A key of `clrecon.cli.main.COMMANDS`.
+    Returns Markdown from the heading on.
     """
     parser = command_parser(command)
     formatter = parser._get_formatter()

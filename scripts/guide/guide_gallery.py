@@ -5,8 +5,6 @@ from __future__ import annotations
 import ast
 from pathlib import Path
 
-__all__ = ["read_script", "write_gallery"]
-
 
 def read_script(path: Path) -> tuple[str, str, str]:
     """Return the title of a script of the gallery, the text below it, and its code."""

@@ -19,8 +19,6 @@ from guide_gallery import write_gallery
 
 from clrecon.cli.main import COMMANDS
 
-__all__ = ["gather_sources", "rewrite_links", "site_pages"]
-
 _LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s#]*)(#[^)\s]*)?\)")
 _CODE = re.compile(r"(^```[\s\S]*?^```|^(?: {4}.*\n)+|`[^`\n]+`)", re.MULTILINE)
 
@@ -101,19 +99,10 @@ def site_pages(root: Path) -> dict[str, str]:
 def rewrite_links(text: str, page: str, pages: dict[str, str]) -> str:
     """Write the links of a page anew for its place in the site.
 
-    Parameters
-    ----------
-    text : str
-        The Markdown of the page.
-    page : str
-        Its path in the project.
-    pages : dict
-        What `site_pages` gave.
-
-    Returns
-    -------
-    str
-        The same Markdown; code is as it was.
+    text: The Markdown of the page.
+    page: Its path in the project.
+    pages: What `site_pages` gave.
+    Returns the same Markdown; code is as it was.
     """
     here = os.path.dirname(pages[page])
 
@@ -144,12 +133,8 @@ def outside_of_code(text: str, change: Callable[[str], str]) -> str:
 def gather_sources(root: Path, folder: Path) -> None:
     """Write the sources of the site.
 
-    Parameters
-    ----------
-    root : Path
-        The project.
-    folder : Path
-        A new folder for them.
+    root: The project.
+    folder: A new folder for them.
     """
     pages = site_pages(root)
     for source, page in pages.items():

@@ -73,13 +73,7 @@ def _plain(meaning: str) -> str:
 
 
 def make_schema(section: Section) -> Schema:
-    """Return the schema of a section, with the entries of its objects as definitions.
-
-    Raises
-    ------
-    ValueError
-        A type of the contract is none of those that it uses.
-    """
+    """Return the schema of a section, with the entries of its objects as definitions."""
     root: Schema = {"type": "object", "properties": {}, "required": []}
     if section.identity:
         root["properties"]["schema"] = {"const": section.identity}

@@ -5,8 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-__all__ = ["find_table", "markdown_table", "put_table"]
-
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     """Return a table of markdown without padding, as the documents have them."""
@@ -22,13 +20,7 @@ def _block(name: str) -> re.Pattern[str]:
 
 
 def find_table(text: str, name: str) -> str:
-    """Return what stands between the markers of this name.
-
-    Raises
-    ------
-    ValueError
-        The markers are not there once.
-    """
+    """Return what stands between the markers of this name."""
     found = _block(name).findall(text)
     if len(found) != 1:
         raise ValueError(f"{len(found)} tables are marked {name!r}, not one")
@@ -36,12 +28,6 @@ def find_table(text: str, name: str) -> str:
 
 
 def put_table(text: str, name: str, table: str) -> str:
-    """Return the text with another table between the markers of this name.
-
-    Raises
-    ------
-    ValueError
-        The markers are not there once.
-    """
+    """Return the text with another table between the markers of this name."""
     find_table(text, name)
     return _block(name).sub(lambda block: block[1] + table + block[3], text)

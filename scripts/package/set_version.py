@@ -27,13 +27,7 @@ TITLE = "## Unreleased\n"
 
 
 def set_version(root: Path, version: str, date: str) -> None:
-    """Write `version` into the files of the project at `root`.
-
-    Raises
-    ------
-    ValueError
-        The version is not of the form 1.2.3 or not higher, or a file does not state the present one once.
-    """
+    """Write `version` into the files of the project at `root`."""
     if not re.fullmatch(r"\d+\.\d+\.\d+", version):
         raise ValueError(f"{version} is no version: three numbers, such as 0.2.0")
     texts = {}

@@ -6,8 +6,6 @@ from collections.abc import Mapping
 from statistics import median
 from typing import Any
 
-__all__ = ["judge_claims"]
-
 Report = Mapping[str, Any]
 
 CLEAR = 1.1

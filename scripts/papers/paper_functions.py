@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 
-__all__ = ["ROOT", "PaperFunction", "find_faults", "load_functions", "table_of_functions"]
-
 ROOT = Path(__file__).resolve().parents[2]
 PAPERS_FOLDER = ROOT / "docs"
 COUNT = 62
@@ -23,23 +21,13 @@ _TABLE = Path(__file__).parent / "functions.json"
 class PaperFunction:
     """One function of the papers.
 
-    Attributes
-    ----------
-    number : int
-        1 to 62, in the order of the papers.
-    function : str
-    paper : str
-        Paper and section.
-    command : str or None
-        Arguments of ``clrecon`` that run it; None where only Python does.
-    python : str or None
-        A public name, ``clrecon.read_volume``, or ``module:name``.
-    test : str or None
-        File and name of a test, ``tests/room/test_file.py::test_name``.
-    figure : str or None
-        Page in docs, or ``#section`` of docs/papers.md, with the figure that belongs to it.
-    note : str or None
-        What is not there, and why: such a row may lack the other entries.
+    number: 1 to 62, in the order of the papers.
+    paper: Paper and section.
+    command: Arguments of ``clrecon`` that run it; None where only Python does.
+    python: A public name, ``clrecon.read_volume``, or ``module:name``.
+    test: File and name of a test, ``tests/room/test_file.py::test_name``.
+    figure: Page in docs, or ``#section`` of docs/papers.md, with the figure that belongs to it.
+    note: What is not there, and why: such a row may lack the other entries.
     """
 
     number: int
@@ -60,11 +48,7 @@ def load_functions(path: Path = _TABLE) -> list[PaperFunction]:
 def find_faults(rows: Sequence[PaperFunction], page: str) -> list[str]:
     """Return what is wrong with the table, a line each: names that are not there, and rows without an explanation.
 
-    Parameters
-    ----------
-    rows : sequence of PaperFunction
-    page : str
-        Text of docs/papers.md; its sections are looked up.
+    page: Text of docs/papers.md; its sections are looked up.
     """
     numbers = [row.number for row in rows]
     faults = [] if numbers == list(range(1, COUNT + 1)) else [f"the rows are not 1 to {COUNT}"]

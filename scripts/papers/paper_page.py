@@ -12,8 +12,6 @@ from paper_sets import SETS
 
 from clrecon.proof.compare.figures import CONTROLS, PAPER
 
-__all__ = ["make_page"]
-
 Report = Mapping[str, Any]
 
 _OPENING = """# Both papers reproduced
@@ -80,13 +78,8 @@ same size and position, and a window of -200 to 800 HU. The last five rows are c
 def make_page(reports: Mapping[str, Report], growing: Mapping[str, Any] | None, rows: Sequence[PaperFunction]) -> str:
     """Return the text of docs/papers.md.
 
-    Parameters
-    ----------
-    reports : mapping
-        By name of the set, what `paper_sets.keep_figures` keeps.
-    growing : mapping or None
-        Cells visited from seeds in some of the vertebrae of one series.
-    rows : sequence of PaperFunction
+    reports: By name of the set, what `paper_sets.keep_figures` keeps.
+    growing: Cells visited from seeds in some of the vertebrae of one series.
     """
     parts = [_OPENING, *_machine(reports), _SLICES, *_slices(reports), *_table_1(reports), _SSIM, *_ssim(reports["a"])]
     parts += [_ACCURACY, *_accuracy(reports["b149"]), _TIMES, *_times(reports, growing)]

@@ -6,8 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["SETS", "PaperSet", "keep_figures"]
-
 MAIN = ("t-mc", "t-mc-soup", "skimage", "vtk-mc", "vtk-fe", "i-mc", "i-mc-golden", "g-mc", "s-mc")
 TABLE = ("t-mc", "i-mc", "i-mc-golden", "g-mc", "s-mc")
 
@@ -16,23 +14,13 @@ TABLE = ("t-mc", "i-mc", "i-mc-golden", "g-mc", "s-mc")
 class PaperSet:
     """A series, and the methods that are compared on it.
 
-    Attributes
-    ----------
-    name : str
-        Of the file in docs/papers.
-    what : str
-        In the tables.
-    vertebrae : int
-    phantom : tuple of str
-        Arguments of ``clrecon phantom`` that make the series.
-    iso_value : float
-        HU.
-    methods : tuple of str
-        Empty: all.
-    paper : bool
-        True: with the pictures against the middle slice.
-    truth : bool
-        True: measured against the true surface of the phantom.
+    name: Of the file in docs/papers.
+    what: In the tables.
+    phantom: Arguments of ``clrecon phantom`` that make the series.
+    iso_value: HU.
+    methods: Empty: all.
+    paper: True: with the pictures against the middle slice.
+    truth: True: measured against the true surface of the phantom.
     """
 
     name: str

@@ -36,10 +36,7 @@ def default_command() -> list[str]:
 def run_under_oclgrind(command: list[str], uninitialized: bool = False) -> tuple[int, str]:
     """Run `command` with Oclgrind as its only OpenCL platform.
 
-    Returns
-    -------
-    int, str
-        Exit status of the command, and the log of Oclgrind.
+    Returns the exit status of the command and the log of Oclgrind.
     """
     with tempfile.TemporaryDirectory(prefix="clrecon-oclgrind-") as folder:
         log = Path(folder) / "oclgrind.log"

@@ -35,7 +35,8 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "support"), str(ROOT / "scripts"), str(ROOT / "scripts" / "guide")]
 
 from reader_peers import READERS  # noqa: E402
-from trap_cases import CASES, FIELD_SIZE, Case, Marks, Size  # type: ignore[import-not-found]  # noqa: E402
+from trap_cases import CASES  # noqa: E402
+from trap_plan import FIELD_SIZE, Case, Marks, Size  # noqa: E402
 
 SILENT_MM = 0.01
 """Largest error of a voxel in mm; a larger one without a warning is a silent fault (bold in the table)."""
@@ -47,16 +48,10 @@ FAULTS = (AttributeError, IndexError, KeyError, NameError, OverflowError, TypeEr
 class Cell:
     """Result of one reader for one case.
 
-    Attributes
-    ----------
-    verdict : {"S", "W", "R", "crash", "timeout", "n/a"}
-    error_mm : float or None
-        Largest distance of a mark from its place; None if no mark was read.
-    shape : list of int or None
-    notes : list of str
-        "mixed": other images are among the slices; "lost": share of the marks that are missing.
-    told : str
-        First warning, or the refusal.
+    verdict: S, W, R, crash, timeout or n/a.
+    error_mm: Largest distance of a mark from its place; None if no mark was read.
+    notes: "mixed": other images are among the slices; "lost": share of the marks that are missing.
+    told: First warning, or the refusal.
     """
 
     verdict: str

@@ -14,8 +14,6 @@ from point_inversions import POINT_INVERSIONS
 
 from clrecon.opencl.sources import kernel_files, read_kernel_source
 
-__all__ = ["EQUIVALENT", "INVERSIONS", "Mutation", "all_mutations", "find_kernels"]
-
 SKIPS = {"every 7th item": "get_global_id(0) % 7u == 3u", "items beyond 500": "get_global_id(0) > 500u"}
 
 ONE_GROUP = "it is launched over one work-group of 64 items, whatever the data"
@@ -388,13 +386,7 @@ class Mutation(NamedTuple):
         return EQUIVALENT.get((self.kernel, self.name), "")
 
     def source(self) -> str:
-        """Return the text of the file with the mutation.
-
-        Raises
-        ------
-        ValueError
-            A text that is to be replaced is not there.
-        """
+        """Return the text of the file with the mutation."""
         text = read_kernel_source(self.file)
         if self.name in SKIPS:
             return _skip(text, self.kernel, SKIPS[self.name])

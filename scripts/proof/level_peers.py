@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from clrecon.geometry import Volume
 from clrecon.mesh import Mesh
 
-__all__ = ["PEER_LEVELS", "move_to_half_heights"]
-
 PEER_LEVELS = {"226 HU": lambda volume: 226.0, "Otsu": by_otsu}
 """Levels of other programs: the preset of InVesalius; Otsu's upper level of three classes (two part air and body)."""
 

@@ -37,25 +37,6 @@ from clrecon.proof.phantom.spine import label_levels, plan_spine
 from clrecon.proof.phantom.vertebra import local_bounds, vertebra_distance
 from clrecon.reading import read_volume
 
-__all__ = [
-    "BODIES",
-    "KINDS_OF_SCAN",
-    "NOTHING",
-    "NOT_IN_TISSUE",
-    "PHANTOMS",
-    "REACH_MM",
-    "SCANNING",
-    "STEP_MM",
-    "THIN",
-    "TRUNK",
-    "Phantom",
-    "Profiles",
-    "draw_phantom",
-    "find_on_mesh",
-    "sample_along",
-    "sample_profiles",
-]
-
 Points = NDArray[np.float64]
 IsBone = Callable[[Points], NDArray[np.bool_]]
 BONE, METAL = MATERIALS.index("bone"), MATERIALS.index("metal")

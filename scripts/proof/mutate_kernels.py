@@ -42,10 +42,7 @@ MEMORY_BYTES = 16 << 30
 def run_mutations(mutations: Sequence[Mutation], device: int) -> Iterator[tuple[Mutation, dict[str, Any]]]:
     """Run mutations in a process apart, and in another one after each crash.
 
-    Yields
-    ------
-    mutation, result
-        The result has ``caught`` (bool or None where it does not build), ``by`` (name of the check) and ``words``.
+    Yields results with ``caught`` (bool or None where it does not build), ``by`` (name of the check) and ``words``.
     """
     left, again = list(mutations), set()
     while left:

@@ -73,18 +73,11 @@ class BrokenRoomError(Exception):
 class Copy:
     """A private copy of a project, in which files are changed.
 
-    Attributes
-    ----------
-    root : Path
-        Folder of the copy.
-    package : str
-        Folder and name of the package in it.
-    warm : WarmTests, optional
-        The process that runs its tests, begun with the first change.
-    first_tests : int
-        Tests that are tried before all others.
-    times_wall, and_wall_s : float
-        Seconds on the clock: so many times those on the processor, and these.
+    root: Folder of the copy.
+    package: Folder and name of the package in it.
+    warm: The process that runs its tests, begun with the first change.
+    first_tests: Tests that are tried before all others.
+    times_wall, and_wall_s: Seconds on the clock: so many times those on the processor, and these.
     """
 
     root: Path
@@ -120,13 +113,7 @@ class Copy:
         return environment
 
     def trace(self, room: str) -> Trace:
-        """Run the tests of a room without a change, and see which lines they run.
-
-        Raises
-        ------
-        BrokenRoomError
-            There are none, one fails, or one fails in another order.
-        """
+        """Run the tests of a room without a change, and see which lines they run."""
         trace = self._trace(room, [f"tests/{room}", *ROOM_TESTS.get(room, ())])
         trace = replace(trace, imports=Imports.read(self.root, [self.package, "tests"]))
         self._check_order(room, trace)
@@ -180,11 +167,8 @@ class Copy:
     def try_change(self, change: Change, trace: Trace) -> tuple[str, int]:
         """Try a change with the tests that run its line.
 
-        Returns
-        -------
-        str, int
-            caught, time, crash, survived, late (ended before its time on the processor was used up: nothing is known)
-            or not run; and the number of tests tried.
+        Returns caught, time, crash, survived, late (ended before its time on the processor was used up: nothing is
+        known) or not run; and the number of tests tried.
         """
         path = self.root / change.file
         original, kept = path.read_bytes(), path.stat()
@@ -210,11 +194,8 @@ class Copy:
 class RoomResult:
     """The changes of a room that were tried.
 
-    Attributes
-    ----------
-    rows : list of dict
-        A change as in `Change.as_dict`, with ``room``, ``outcome``, ``tests`` (it was tried with so many), ``digest``
-        (of the file without the change) and, for an equivalent change, ``why``.
+    rows: A change as in `Change.as_dict`, with ``room``, ``outcome``, ``tests`` (it was tried with so many), ``digest``
+    (of the file without the change) and, for an equivalent change, ``why``.
     """
 
     room: str
@@ -268,22 +249,10 @@ def try_room(
 ) -> Iterator[dict[str, Any]]:
     """Try changes of a room one after the other.
 
-    Parameters
-    ----------
-    copy : Copy
-    room : str
-    changes : sequence of Change
-    equivalents : sequence of Equivalent
-        Changes that are not tried.
-    known : sequence of dict
-        Earlier rows; what was caught then is not tried again while its file is the same.
-    until : float
-        Time of `time.monotonic` after which no change is begun.
-
-    Yields
-    ------
-    dict
-        A row of `RoomResult`; errors are those of `Copy.trace`.
+    equivalents: Changes that are not tried.
+    known: Earlier rows; what was caught then is not tried again while its file is the same.
+    until: Time of `time.monotonic` after which no change is begun.
+    Yields rows of `RoomResult`.
     """
     earlier = {
         (row["file"], row["digest"], row["operator"], row["occurrence"]): row

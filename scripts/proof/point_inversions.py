@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = ["POINT_INVERSIONS"]
-
 POINT_INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
     "find_cores": {"mask": (("store_words(core,", "store_words(~core,"),)},
     "count_row_runs": {

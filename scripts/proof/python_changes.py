@@ -17,18 +17,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-__all__ = [
-    "Change",
-    "Equivalent",
-    "choose_changes",
-    "definition_names",
-    "find_places",
-    "make_change",
-    "name_places",
-    "read_equivalents",
-    "statement_lines",
-]
-
 ARITHMETIC = ("Add", "Sub", "Mul", "Div", "FloorDiv", "Mod")
 BITS = ("BitAnd", "BitOr", "BitXor", "LShift", "RShift")
 ORDER = ("Eq", "NotEq", "Lt", "LtE", "Gt", "GtE")
@@ -56,14 +44,9 @@ Position = tuple[int, int]
 class Place:
     """What one operator of cosmic-ray can do at one position of a file.
 
-    Attributes
-    ----------
-    operator : str
-        Name of the operator.
-    occurrence : int
-        Number of this place among all places of the operator in the file.
-    start : (int, int)
-        Line and column.
+    operator: Name of the operator.
+    occurrence: Number of this place among all places of the operator in the file.
+    start: Line and column.
     """
 
     operator: str
@@ -75,19 +58,11 @@ class Place:
 class Change:
     """A change of a file in one place.
 
-    Attributes
-    ----------
-    file : str
-        Path below the root of the project.
-    line : int
-    operator : str
-        Name of the operator of cosmic-ray.
-    occurrence : int
-        Number of the place among those of the operator in the file.
-    before, after : str
-        The lines that differ, without the blanks around them.
-    text : str
-        The whole changed file.
+    file: Path below the root of the project.
+    operator: Name of the operator of cosmic-ray.
+    occurrence: Number of the place among those of the operator in the file.
+    before, after: The lines that differ, without the blanks around them.
+    text: The whole changed file.
     """
 
     file: str
@@ -110,12 +85,7 @@ class Change:
 class Equivalent:
     """A change that changes no result.
 
-    Attributes
-    ----------
-    file : str
-    before, after : str
-        As in `Change`.
-    why : str
+    before, after: As in `Change`.
     """
 
     file: str
@@ -231,15 +201,8 @@ def name_places(texts: dict[str, str]) -> dict[tuple[str, ...], list[Place]]:
     A name is file, definition around the position, text of its line without the blanks at its ends, and the number of
     the position among those of the same three.  An edit elsewhere leaves it alone.
 
-    Parameters
-    ----------
-    texts : dict
-        Path below the root -> text of the file.
-
-    Returns
-    -------
-    dict
-        Name -> what can be done there, in an order that another edit leaves alone too.
+    texts: Path below the root -> text of the file.
+    Returns name -> what can be done there, in an order that another edit leaves alone too.
     """
     named: dict[tuple[str, ...], list[Place]] = {}
     for file in sorted(texts):
@@ -278,13 +241,8 @@ def choose_changes(texts: dict[str, str], count: int, seed: str) -> list[Change]
 
     The order is that of a hash of the seed and the position's name: an edit draws no other changes elsewhere.
 
-    Parameters
-    ----------
-    texts : dict
-        Path below the root -> text of the file.
-    count : int
-        At most so many; fewer where there are fewer positions.
-    seed : str
+    texts: Path below the root -> text of the file.
+    count: At most so many; fewer where there are fewer positions.
     """
 
     def draw(*words: str) -> str:

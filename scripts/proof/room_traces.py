@@ -22,10 +22,7 @@ FAR = 99
 class Imports:
     """How many imports lie between files of tests and files of the package.
 
-    Parameters
-    ----------
-    imported : mapping
-        File -> files that it imports.
+    imported: File -> files that it imports.
     """
 
     def __init__(self, imported: Mapping[str, Iterable[str]]):
@@ -72,18 +69,11 @@ def _imported(text: str, files: set[str]) -> Iterator[str]:
 class Trace:
     """What the tests of a room run without a change.
 
-    Attributes
-    ----------
-    lines : dict
-        File below the root -> line -> tests, by their names in pytest without parameters.
-    seconds : dict
-        Test -> processor time in seconds.
-    start : float
-        Processor time before the first test, in seconds.
-    modules : list of str
-        Modules from outside of the project that the tests import.
-    imports : Imports
-        Tests that import a changed file with fewer steps are tried before others.
+    lines: File below the root -> line -> tests, by their names in pytest without parameters.
+    seconds: Test -> processor time in seconds.
+    start: Processor time before the first test, in seconds.
+    modules: Modules from outside of the project that the tests import.
+    imports: Tests that import a changed file with fewer steps are tried before others.
     """
 
     lines: dict[str, dict[int, list[str]]]

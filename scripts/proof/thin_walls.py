@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from clrecon.geometry import Volume
 
-__all__ = ["SHAPES", "Shape", "draw_shape"]
-
 Values = NDArray[np.float64]
 FINER = 4
 """Samples along each axis of a voxel."""

@@ -33,14 +33,10 @@ Lines = dict[str, set[int]]
 class Tracer:
     """Measures lines and seconds of each test, and keeps them as JSON.
 
-    Parameters
-    ----------
-    target : Path
-        File for the result: ``lines`` (file -> line -> tests without parameters), ``seconds`` (test -> s), ``start``
-        (s before the first test) and ``modules`` (imported from outside of the project).  All seconds are of the
-        processor.
-    sources : str
-        Folder whose files are traced.
+    target: File for the result: ``lines`` (file -> line -> tests without parameters), ``seconds`` (test -> s),
+    ``start`` (s before the first test) and ``modules`` (imported from outside of the project).  All seconds are of the
+    processor.
+    sources: Folder whose files are traced.
     """
 
     def __init__(self, target: Path, sources: str):

@@ -23,8 +23,6 @@ from typing import Any
 
 import pytest
 
-__all__ = ["PYTEST_OPTIONS", "Outcome", "Run", "WarmTests"]
-
 PYTEST_OPTIONS = ("-x", "-q", "-p", "no:cacheprovider", "--tb=line", "-m", "not slow and not fuzz")
 MEMORY_BYTES = 16 * 2**30
 """Address space of a run: a change can ask for any amount of memory."""
@@ -34,18 +32,11 @@ MEMORY_BYTES = 16 * 2**30
 class Run:
     """Tests to run.
 
-    Attributes
-    ----------
-    stages : list of list of str
-        Names of tests, in order.  A stage begins when the one before has passed: only its files are collected.
-    cpu_s : list of float
-        Processor time that each stage may take, in seconds: a loop without end is seen in the first tests.
-    wall_s : float
-        Seconds after which the run is ended, however little the processor had to do.
-    folder : str
-        For pytest's temporary folders.
-    said : str
-        File for the output.
+    stages: Names of tests, in order.  A stage begins when the one before has passed: only its files are collected.
+    cpu_s: Processor time that each stage may take, in seconds: a loop without end is seen in the first tests.
+    wall_s: Seconds after which the run is ended, however little the processor had to do.
+    folder: For pytest's temporary folders.
+    said: File for the output.
     """
 
     stages: list[list[str]]
@@ -59,13 +50,9 @@ class Run:
 class Outcome:
     """What came of a run.
 
-    Attributes
-    ----------
-    status : int
-        Exit status of pytest, or minus the signal that ended the run.  ``-SIGXCPU``: it took more processor time than
-        it may.  ``-SIGALRM``: it was ended after `Run.wall_s`; nothing is known of it then.
-    cpu_s : float
-        Processor time that it took, in seconds, without that of processes left behind.
+    status: Exit status of pytest, or minus the signal that ended the run.  ``-SIGXCPU``: it took more processor time
+    than it may.  ``-SIGALRM``: it was ended after `Run.wall_s`; nothing is known of it then.
+    cpu_s: Processor time that it took, in seconds, without that of processes left behind.
     """
 
     status: int
@@ -89,14 +76,9 @@ class Chooser:
 class WarmTests:
     """A process that waits with imported modules and runs tests in forks of itself.
 
-    Parameters
-    ----------
-    root : Path
-        Folder in which tests run.
-    environment : dict
-        Variables of the process.
-    modules : sequence of str
-        Modules to import before the first fork.  None of them may be what is changed.
+    root: Folder in which tests run.
+    environment: Variables of the process.
+    modules: Modules to import before the first fork.  None of them may be what is changed.
     """
 
     def __init__(self, root: Path, environment: dict[str, str], modules: Sequence[str]):
@@ -124,13 +106,7 @@ class WarmTests:
         return json.loads(answer)
 
     def run(self, run: Run) -> Outcome:
-        """Run tests in a fork.
-
-        Raises
-        ------
-        ChildProcessError
-            The process that forks has ended.
-        """
+        """Run tests in a fork."""
         return Outcome(**self._ask(asdict(run)))
 
     def close(self) -> None:

@@ -11,7 +11,7 @@ import compare_readers
 import numpy as np
 import pytest
 from refusals import refused
-from trap_cases import Marks
+from trap_plan import Marks
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -8,8 +8,6 @@ from textwrap import indent
 
 import pytest
 
-__all__ = ["run_instead"]
-
 
 def run_instead(monkeypatch: pytest.MonkeyPatch, folder: Path, module: str, code: str) -> None:
     """Let interpreters started from now on with ``-m module`` run `code`; `folder` is for the file that they import."""

@@ -7,17 +7,9 @@ from pathlib import Path
 
 from printed_text import Printer
 
-__all__ = ["check_refused", "parse_command"]
-
 
 def parse_command(arguments: list[str]) -> None:
-    """Parse `arguments` as clrecon would.
-
-    Raises
-    ------
-    UsageError
-        They are not understood.
-    """
+    """Parse `arguments` as clrecon would."""
     from clrecon.cli.common import Parser, add_common
     from clrecon.cli.main import COMMANDS
     from clrecon.errors import UsageError

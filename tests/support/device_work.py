@@ -13,8 +13,6 @@ from clrecon.labels import LabelMap
 from clrecon.mesh import Mesh
 from clrecon.rendering import Rendering
 
-__all__ = ["SIZE", "WORK", "centre_line", "label_boxes", "mesh_arrays"]
-
 SIZE = (24, 20)
 
 

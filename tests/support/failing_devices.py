@@ -10,8 +10,6 @@ from clrecon.errors import DeviceError, DeviceMemoryError
 from clrecon.opencl import Device, arrays
 from clrecon.opencl.quirks import import_pyopencl
 
-__all__ = ["BurntDevice", "Failing", "lost_error", "pretended_gpu"]
-
 
 def pretended_gpu(device: Device) -> Device:
     """Return a GPU with its own memory that computes on the same hardware, and has the CPU device as its stand-in."""
@@ -34,15 +32,9 @@ def lost_error() -> Exception:
 class Failing:
     """Counts buffers and launches on a device, and lets some of one kind fail, from number `first` to `last`.
 
-    Parameters
-    ----------
-    kind : {"buffer", "launch"}
-    first, last : int
-        Numbers from 1; 0: none fails.
-    label : str, optional
-        Only of the device with this label; None: of all.
-    error : Exception, optional
-        That of launches; default: no memory.
+    first, last: Numbers from 1; 0: none fails.
+    label: Only of the device with this label; None: of all.
+    error: That of launches; default: no memory.
     """
 
     def __init__(

@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["sheet"]
-
 
 def sheet(size: int) -> tuple[NDArray[np.float64], NDArray[np.uint32]]:
     """Return a square of ``size * size`` vertices, 1 mm apart, in the plane z = 0.

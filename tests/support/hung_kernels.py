@@ -7,8 +7,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-__all__ = ["start_command"]
-
 ROOT = Path(__file__).resolve().parents[2]
 
 _CHILD = '''

@@ -108,11 +108,7 @@ def write_seg(
 ) -> Path:
     """Write a DICOM SEG with highdicom.
 
-    Parameters
-    ----------
-    segments : list of (name, mask[k, j, i])
-    ct : list of pydicom.Dataset
-        The slices, in the order of k.
+    ct: The slices, in the order of k.
     """
     import highdicom as hd
     from pydicom.sr.codedict import codes

@@ -62,16 +62,10 @@ def expected_mm(name: str) -> float:
 class Row:
     """A file that is odd.
 
-    Attributes
-    ----------
-    name : str
-    write : callable
-        Writes the file into a folder; returns the map that is read and the voxels that it must have.
-    verdict : {"exact", "exact+warning", "refused"}
-    words : str
-        What the warning or the refusal must hold.
-    file : callable, optional
-        Writes the file alone: its path, and voxels and affine that it would have if it were not odd.
+    write: Writes the file into a folder; returns the map that is read and the voxels that it must have.
+    verdict: exact, exact+warning or refused.
+    words: What the warning or the refusal must hold.
+    file: Writes the file alone: its path, and voxels and affine that it would have if it were not odd.
     """
 
     name: str

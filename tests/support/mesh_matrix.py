@@ -31,22 +31,12 @@ RAS = np.diag([-1.0, -1.0, 1.0])
 class MeshCase:
     """A file and its truth.
 
-    Attributes
-    ----------
-    name : str
-    extension : str
-    write : callable
-        Writes the file.
-    vertices, faces : ndarray
-        LPS mm; the faces turn counter-clockwise seen from outside.
-    numbers : ndarray, shape (3, 3)
-        LPS mm to the numbers that a reader without frames returns: RAS, or the scene of glTF.
-    names, colors : tuple
-        Those that the file holds.
-    refused : str
-        What clrecon says, where it refuses.
-    tolerance : float
-        mm by which the format or the float32 of others rounds.
+    write: Writes the file.
+    vertices, faces: LPS mm; the faces turn counter-clockwise seen from outside.
+    numbers: LPS mm to the numbers that a reader without frames returns: RAS, or the scene of glTF.
+    names, colors: Those that the file holds.
+    refused: What clrecon says, where it refuses.
+    tolerance: mm by which the format or the float32 of others rounds.
     """
 
     name: str

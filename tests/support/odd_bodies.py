@@ -40,11 +40,7 @@ BODIES: dict[str, dict[str, Any]] = {
 class OddBody:
     """A phantom with its truth.
 
-    Attributes
-    ----------
-    volume : Volume
-    labels : ndarray, shape (nk, nj, ni), uint8
-        Place in `MATERIALS`.
+    labels: (nk, nj, ni) uint8, place in `MATERIALS`.
     """
 
     volume: Volume

@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Shape", "cube", "plane", "sphere"]
-
 POINTS_A_MM2 = 2.4
 NOISE_MM = 0.2
 
@@ -18,16 +16,10 @@ NOISE_MM = 0.2
 class Shape:
     """A cloud with its truth.
 
-    Attributes
-    ----------
-    clean, points : ndarray, shape (n, 3), float32
-        Points of the shape, and the same with noise.
-    normals : ndarray, shape (n, 3)
-        True normals of the clean points, outward.
-    distance : callable
-        Signed distance of points from the shape's surface, mm; negative inside.
-    regions : dict of str to ndarray, shape (n,), bool
-        Parts of the shape over which figures are taken.
+    clean, points: (n, 3) float32, points of the shape, and the same with noise.
+    normals: (n, 3), true normals of the clean points, outward.
+    distance: Signed distance of points from the shape's surface, mm; negative inside.
+    regions: (n,) bool, parts of the shape over which figures are taken.
     """
 
     clean: np.ndarray

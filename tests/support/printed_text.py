@@ -8,8 +8,6 @@ from typing import Any
 import pytest
 from refusals import assert_facts
 
-__all__ = ["Printed", "Printer"]
-
 
 class Printed:
     """What came since the last look at both streams; the words of a text are pinned in the test nearest to it."""

@@ -8,8 +8,6 @@ from contextlib import contextmanager
 
 import pytest
 
-__all__ = ["assert_facts", "assert_one_line", "refused"]
-
 _NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d{1,3}(?:,\d{3})+|\d+)(?:\.\d+)?(?:e[-+]?\d+)?(?![\w]|\.\d)")
 
 
@@ -18,13 +16,7 @@ def _numbers_in(text: str) -> list[float]:
 
 
 def assert_facts(text: str, *facts: str | float) -> None:
-    """Assert that `text` has each of `facts`: a number however it is written, a name as a word of its own.
-
-    Raises
-    ------
-    ValueError
-        There is no fact, or one is a sentence: its words are pinned in one test, by `match` of pytest.raises.
-    """
+    """Assert that `text` has each of `facts`: a number however it is written, a name as a word of its own."""
     if not facts or any(isinstance(fact, str) and (not fact or re.search(r"\s", fact)) for fact in facts):
         raise ValueError(f"facts are numbers and names, one word each, not {facts}")
     for fact in facts:

@@ -115,13 +115,8 @@ def grab_window(display: str, window: int) -> np.ndarray | None:
 class Window:
     """A command with a window, and what a user sees and does.
 
-    Parameters
-    ----------
-    display : str
-    arguments : sequence of str
-        Of ``clrecon``.
-    folder : Path
-        Its current folder.
+    arguments: Of ``clrecon``.
+    folder: Its current folder.
     """
 
     def __init__(self, display: str, arguments: Sequence[str | Path], folder: Path):

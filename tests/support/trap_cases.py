@@ -15,26 +15,9 @@ from pydicom.dataset import Dataset
 from trap_bytes import add_byte_cases
 from trap_figures import add_figure_cases
 from trap_mixtures import add_mixture_cases
-from trap_plan import (
-    BACKGROUND_HU,
-    CASES,
-    EXACT,
-    FIELD_SIZE,
-    FOREIGN_HU,
-    GAP_MM,
-    OBLIQUE,
-    REFUSED,
-    WARNED,
-    Case,
-    Marks,
-    Size,
-    plan_for,
-    write_slices,
-)
+from trap_plan import CASES, FOREIGN_HU, GAP_MM, OBLIQUE, REFUSED, WARNED, Marks, Size, plan_for, write_slices
 from trap_plan import add_case as _case
 from trap_plan import add_simple as _simple
-
-__all__ = ["BACKGROUND_HU", "CASES", "EXACT", "FIELD_SIZE", "REFUSED", "WARNED", "Case", "Marks", "Size"]
 
 
 def _both(*changes: Change) -> Change:

@@ -89,20 +89,12 @@ class MarkedPlan(Plan):
 class Case:
     """One row of the matrix.
 
-    Attributes
-    ----------
-    verdict : {"exact", "exact+warning", "refused"}
-        What clrecon must do.
-    words : tuple of str
-        Texts that the warnings, or the refusal, must hold.
-    again : mapping or None
-        Options of `read_volume` that make a refused series readable: then exact, with `again_words` in the warnings.
-    bound : {"written", "rounded", "far", "jitter"}
-        Which tolerance of tests/support/tolerances.py holds for the positions.
-    looks_right : bool
-        Each slice has its place, and yet it is not the volume that it seems: a table of its own.
-    harmless : bool
-        Who reads it without a word is right all the same.
+    verdict: What clrecon must do: exact, exact+warning or refused.
+    words: Texts that the warnings, or the refusal, must hold.
+    again: Options of `read_volume` that make a refused series readable: then exact, with `again_words` in the warnings.
+    bound: Which tolerance of tests/support/tolerances.py holds for the positions.
+    looks_right: Each slice has its place, and yet it is not the volume that it seems: a table of its own.
+    harmless: Who reads it without a word is right all the same.
     """
 
     name: str

@@ -123,16 +123,9 @@ def serving(open_session: Any, port: int | None = None, **given: Any) -> Iterato
 class Client:
     """A browser that keeps what it was told.
 
-    Attributes
-    ----------
-    facts : dict or None
-        The latest.
-    fixed : dict
-        What does not change while it is connected.
-    notes : list of dict
-    pictures : list of (dict, Image)
-    shows : bool
-        True: it says that it has shown each picture.
+    facts: The latest.
+    fixed: What does not change while it is connected.
+    shows: True: it says that it has shown each picture.
     """
 
     def __init__(self, socket: Any) -> None:

@@ -19,8 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 from peers.vtk_stage import Scene, Stage, vtk_version
 
-__all__ = ["FixedPointPeer"]
-
 PIXEL_SCALE = 32767
 """The mapper's picture has 15 bits a channel."""
 
@@ -28,12 +26,7 @@ PIXEL_SCALE = 32767
 class FixedPointPeer:
     """vtkFixedPointVolumeRayCastMapper on `threads` threads, without OpenGL.
 
-    Parameters
-    ----------
-    voxels : ndarray, shape (nk, nj, ni)
-        Shared, not copied.
-    scene : Scene
-    threads : int
+    voxels: (nk, nj, ni), shared, not copied.
     """
 
     name = "vtkFixedPointVolumeRayCastMapper"

@@ -20,26 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 from peers.vtk_stage import Scene, Stage, vtk_version
 
-__all__ = ["GpuPeer"]
-
 
 class GpuPeer:
     """vtkOpenGLGPUVolumeRayCastMapper in a process of its own; a context manager.
 
-    Parameters
-    ----------
-    voxels : ndarray, shape (nk, nj, ni)
-    scene : Scene
-
-    Attributes
-    ----------
-    renderer : str
-        Name of the renderer as OpenGL reports it.
-
-    Raises
-    ------
-    RuntimeError
-        There is no OpenGL, or the process dies.
+    renderer: Name of the renderer as OpenGL reports it.
     """
 
     name = "vtkOpenGLGPUVolumeRayCastMapper"

@@ -8,30 +8,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Scene", "Stage", "scene_of", "vtk_version"]
-
 
 @dataclass(frozen=True)
 class Scene:
     """A scene in plain numbers: volume, look and camera.
 
-    Attributes
-    ----------
-    affine : list of 4 lists of 4 floats
-        Index (i, j, k) to LPS mm, its steps at right angles.
-    points : list of (hu, red, green, blue, opacity)
-        The transfer function; linear between them, constant beyond.
-    unit_distance, ray_step : float
-        mm.
-    ambient, diffuse, specular, specular_power : float
-        Phong's constants, light at the camera.
-    shade : bool
-    position, focal_point, up : (x, y, z)
-        Camera, LPS mm.
-    view_angle, parallel_scale : float or None
-        One of the two is given; meanings as in VTK.
-    width, height : int
-        Pixels.
+    affine: Index (i, j, k) to LPS mm, its steps at right angles.
+    points: HU, red, green, blue and opacity of the transfer function; linear between them, constant beyond.
+    unit_distance, ray_step: mm.
+    ambient, diffuse, specular, specular_power: Phong's constants, light at the camera.
+    position, focal_point, up: Camera, LPS mm.
+    view_angle, parallel_scale: One of the two is given; meanings as in VTK.
+    width, height: Pixels.
     """
 
     affine: Any
@@ -62,14 +50,7 @@ def scene_of(
     ray_step: float,
     shade: bool = True,
 ) -> Scene:
-    """The scene that clrecon draws of `volume` with the same arguments.
-
-    Raises
-    ------
-    RuntimeError
-        VTK cannot draw it: slices that are uneven or sheared, gradient opacity, a light of its own, light that fades
-        with the gradient.
-    """
+    """The scene that clrecon draws of `volume` with the same arguments."""
     steps = volume.affine[:3, :3] / volume.spacing
     if volume.uneven or np.abs(steps.T @ steps - np.eye(3)).max() > 1e-4:
         raise RuntimeError("the peer draws volumes with axes at right angles and even slices only")

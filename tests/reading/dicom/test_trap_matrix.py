@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tolerances import AFFINE_MM, FAR_AFFINE_MM, JITTER_AFFINE_MM, ROUNDED_AFFINE_MM
-from trap_cases import BACKGROUND_HU, CASES, EXACT, REFUSED, WARNED, Case, Marks, Size
-from trap_plan import BODY_HU
+from trap_cases import CASES
+from trap_plan import BACKGROUND_HU, BODY_HU, EXACT, REFUSED, WARNED, Case, Marks, Size
 from variants import daily
 
 from clrecon.errors import ClreconError, RefusedInputError
