@@ -8,10 +8,10 @@
 `phantoms` measures every phantom of `level_phantoms.py` (about five minutes on one core) at the preset bone, at
 `--hu auto`, at `--hu half:BONE,TISSUE` with the phantom's own materials, at the best of the levels from 100 to 1200 HU,
 the surface of `--surface cortex` itself, and surfaces as others make them (`level_peers.py`); `--seed` draws other
-bodies, whose figures are in phantoms_SEED.  `scans` does what can be done without a truth: the level that auto picks in
-the scan, in its two halves and in every other slice, and how the surface differs.  Both keep their figures in
-docs/benchmarks/levels; `page` writes them into docs/iso_value.md.  The scans and the fitted surfaces need an OpenCL
-device.
+bodies, whose figures are in phantoms_SEED; `--fitted` measures the fitted surface alone.  `scans` does what can be done
+without a truth: the level that auto picks in the scan, in its two halves and in every other slice, and how the surface
+differs.  Both keep their figures in docs/benchmarks/levels; `page` writes them into docs/iso_value.md.  The scans and
+the fitted surfaces need an OpenCL device.
 """
 
 from __future__ import annotations
@@ -111,6 +111,14 @@ def measure_fitted(phantom: Phantom, volume: Volume, profiles: Profiles, surface
     }
 
 
+def try_fit(phantom: Phantom, volume: Volume, profiles: Profiles, surface: Mesh) -> dict[str, Any]:
+    """Measure the fitted surface, or say why there is none."""
+    try:
+        return measure_fitted(phantom, volume, profiles, surface)
+    except NoSurfaceError as error:
+        return {"refused": str(error)}
+
+
 def describe_errors(errors: NDArray[np.floating], level: float, scale: float = 1.0) -> dict[str, float]:
     """Describe signed distances from the truth, NaN where there is no surface; `scale` is that of the phantom."""
     found = errors[np.isfinite(errors)]
@@ -145,20 +153,20 @@ def _level(choice: IsoChoice | None) -> float | None:
     return None if choice is None else choice.iso_value
 
 
-def measure_phantom(phantom: Phantom) -> dict[str, Any]:
-    """Measure all rules on one phantom; "best" has the largest share within `CLOSE_MM`."""
+def measure_phantom(phantom: Phantom, *, fitted_alone: bool = False) -> dict[str, Any]:
+    """Measure all rules on one phantom, or the fitted surface; "best" has the largest share within `CLOSE_MM`."""
     import clrecon
 
     volume = draw_phantom(phantom)
+    spacing = [round(float(step), 4) for step in volume.spacing]
+    figures: dict[str, Any] = {"name": phantom.name, "group": phantom.group, "spacing_mm": spacing}
+    if fitted_alone and phantom.group != NOTHING:
+        profiles = sample_profiles(phantom, volume)
+        surface = clrecon.extract_isosurface(volume, level_of_start(phantom))
+        return {**figures, "points": len(profiles.values), "fitted": try_fit(phantom, volume, profiles, surface)}
     choice, reason, seconds = choose(volume)
     level = _level(choice)
-    figures: dict[str, Any] = {
-        "name": phantom.name,
-        "group": phantom.group,
-        "spacing_mm": [round(float(step), 4) for step in volume.spacing],
-        "auto": {"level_hu": level, "reason": reason},
-        "seconds": round(seconds, 3),
-    }
+    figures |= {"auto": {"level_hu": level, "reason": reason}, "seconds": round(seconds, 3)}
     if phantom.group == NOTHING:
         return figures
     profiles = sample_profiles(phantom, volume)
@@ -172,10 +180,7 @@ def measure_phantom(phantom: Phantom) -> dict[str, Any]:
     figures["best"] = max(tried.values(), key=lambda one: one["close_share"])
     surface = clrecon.extract_isosurface(volume, level_of_start(phantom))
     figures["peers"] = measure_peers(phantom, volume, profiles, surface)
-    try:
-        figures["fitted"] = measure_fitted(phantom, volume, profiles, surface)
-    except NoSurfaceError as error:
-        figures["fitted"] = {"refused": str(error)}
+    figures["fitted"] = try_fit(phantom, volume, profiles, surface)
     if choice is not None:
         tissue, way = choice.tissue_hu, choice.bone_hu - choice.tissue_hu
         figures["shares"] = {f"{share:g}": measure_errors(profiles, round(tissue + share * way)) for share in SHARES}
@@ -367,11 +372,12 @@ def write_page() -> None:
 
 
 def _keep(name: str, figures: Sequence[dict[str, Any]]) -> None:
-    """Keep figures in place of those of the same names, those of phantoms in their order."""
+    """Keep figures in place of the same ones of the same names, those of phantoms in their order."""
     FIGURES.mkdir(parents=True, exist_ok=True)
     path = FIGURES / f"{name}.json"
     before = json.loads(path.read_text("utf-8")) if path.exists() else []
-    kept = {one["name"]: one for one in [*before, *figures]}
+    kept = {one["name"]: one for one in before}
+    kept |= {one["name"]: {**kept.get(one["name"], {}), **one} for one in figures}
     order = {phantom.name: place for place, phantom in enumerate(PHANTOMS)}
     rows = sorted(kept.values(), key=lambda one: order.get(one["name"], 0))
     finite = json.loads(json.dumps(rows), parse_constant=lambda _: math.nan)
@@ -383,6 +389,7 @@ def main() -> None:
     parser.add_argument("what", choices=("phantoms", "scans", "page"))
     parser.add_argument("names", nargs="*", metavar="NAME", help="phantoms, else all; of scans NAME=CT_FOLDER")
     parser.add_argument("--seed", type=int, help="of bodies other than those of the tables")
+    parser.add_argument("--fitted", action="store_true", help="measure the fitted surface alone")
     options = parser.parse_args()
     if options.what == "page":
         write_page()
@@ -392,7 +399,7 @@ def main() -> None:
         for phantom in PHANTOMS if options.seed is None else with_seed(options.seed):
             if options.names and phantom.name not in options.names:
                 continue
-            figures.append(measure_phantom(phantom))
+            figures.append(measure_phantom(phantom, fitted_alone=options.fitted))
             print(
                 phantom.name,
                 *(f"{rule} {_cell(figures[-1][rule])};" for rule in RULES if rule in figures[-1]),

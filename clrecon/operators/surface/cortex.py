@@ -98,6 +98,7 @@ class StackFrame:
     """Where points lie between the slices of a volume, even or not: in steps of slice 0, and in mm of height.
 
     slices: ndarray, shape (nk, 4), float32. As the kernel takes them.
+    steps: ndarray, shape (3, 3). From voxel to voxel along i, j and, at the usual gap, k, LPS mm.
     """
 
     def __init__(self, volume: Volume):
@@ -111,6 +112,8 @@ class StackFrame:
         self.normal = normal
         self.gaps = np.diff(self._heights)
         self.usual_gap = float(np.median(self.gaps)) if len(self.gaps) else 1.0
+        along_k = volume.affine[:3, 2]
+        self.steps = np.stack([*volume.affine[:3, :2].T, along_k * (self.usual_gap / abs(along_k @ normal))])
         self.slices = np.zeros((len(origins), 4), np.float32)
         self.slices[:, :3] = (origins - self._origin) @ self._matrix.T
         self.slices[:-1, 3] = 1.0 / self.gaps
@@ -125,6 +128,18 @@ class StackFrame:
     def directions(self, normals: NDArray[np.floating]) -> Float32Array:
         """Return the kernel's directions (n, 4) of unit vectors (n, 3) in LPS."""
         return self._turn(normals, np.zeros(3))
+
+    def steps_along(self, normals: NDArray[np.floating], gap: Float32Array) -> Float32Array:
+        """Return how far apart voxels lie along unit vectors (n, 3), mm.
+
+        That is the fourth root of the sum of the fourth powers of what each axis has of it.
+
+        gap: ndarray, shape (n,). Square of the gap between slices, in units of the usual one.
+        """
+        along = normals @ self.steps.T.astype(np.float32)
+        along *= along
+        along[:, 2] *= gap
+        return np.asarray(np.sqrt(np.sqrt(np.einsum("na,na->n", along, along))), np.float32)
 
     def _turn(self, vectors: NDArray[np.floating], origin: Float64Array) -> Float32Array:
         turned = np.zeros((len(vectors), 4), np.float32)
@@ -196,9 +211,9 @@ class WallFits:
         return tuple(vars(self).values())
 
 
-def blurs_of(values: Float32Array, blur_mm: float, across_mm: float) -> Float32Array:
-    """Return the width of the blur along each of the profiles (ROWS, n), mm: it grows with the gap between slices."""
-    steep, gap = values[SAMPLES], values[SAMPLES + 1]
+def blurs_of(frames: Float32Array, blur_mm: float, across_mm: float) -> Float32Array:
+    """Return the width of the blur along profiles, mm, from their last rows (2, n): it grows with the slices' gap."""
+    steep, gap = frames
     across = np.maximum(blur_mm**2 + (across_mm**2 - blur_mm**2) * gap, 0.1 * blur_mm**2)
     return np.asarray(np.sqrt(blur_mm**2 * (1.0 - steep) + across * steep), np.float32)
 
@@ -242,6 +257,11 @@ class WallProfiles:
             rise=max(RISE_HU, RISE_SIGMAS * noise_hu), stride=self._stride, count=self._count,
         )  # fmt: skip
         return WallFits(*download(device, fits, fits_d)[:, : self._count])
+
+    def frames(self) -> Float32Array:
+        """Return the last rows of the profiles, shape (2, n): how each lies across the slices, and their gap there."""
+        rows = np.empty((ROWS - SAMPLES, self._stride), np.float32)
+        return download(self._device, rows, self._values_d, 4 * SAMPLES * self._stride)[:, : self._count]
 
     def fit_with(self, constants: CortexConstants) -> WallFits:
         """Fit a wall to each profile with the constants of a scan."""

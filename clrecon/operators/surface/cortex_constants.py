@@ -243,7 +243,7 @@ def _search_blurs(fit: _Fit, part: slice, best: _Trial, factors: tuple[float, ..
 def _measure_cortex(fit: _Fit, values: Float32Array, part: slice, trial: _Trial) -> tuple[float, int]:
     """Return the HU of compact bone in a part of the profiles, and how many walls are thick enough to show it."""
     fits = fit(trial, _WIDE_SPREAD)
-    blurs = blurs_of(values[:, part], trial.blur_mm, trial.across_mm)
+    blurs = blurs_of(values[SAMPLES:, part], trial.blur_mm, trial.across_mm)
     thick = (fits.thickness_mm[part] > _THICK_BLURS * blurs) & (blurs < _SHARP * trial.blur_mm)
     if np.count_nonzero(thick) < _FEWEST_THICK:
         return trial.cortex_hu, int(np.count_nonzero(thick))

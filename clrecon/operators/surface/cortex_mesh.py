@@ -28,6 +28,7 @@ from clrecon.operators.surface.cortex import (
     ProfileScale,
     WallFits,
     WallProfiles,
+    blurs_of,
     unexplained_hu,
 )
 from clrecon.operators.surface.cortex_constants import find_groups, measure_constants
@@ -73,9 +74,13 @@ LEAST_ROOM = 2
 MOST_SHIFT_MM = 2.5
 """Largest shift of a vertex to its wall; a fit with a larger shift counts as bad."""
 
-_ERROR_FACTOR, _LEAST_ERROR = 1.125, 0.054
-"""By what the fit's own error is multiplied, and what is added in squares, in blurs: so 75 % of the places of 22
-phantoms lie within the stated error, and 94 % within 1.96 times that."""
+_WEIGHT_FACTOR, _LEAST_WEIGHED = 1.125, 0.054
+"""By what the fit's own error is multiplied where it weighs neighbours, and what is added in squares, in blurs."""
+
+_ERROR_FACTOR, _LEAST_ERROR = 0.95, 0.03
+_COARSE_ERROR = 0.033
+"""The same of the error that is stated, and the share of step^3 / blur^2 that is added in squares: interpolated values
+are blurred more between voxels than at them, which the model does not know."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +93,7 @@ class CortexFit:
     shift_mm: From the vertex along its normal, outwards positive.
     thickness_mm: Of the wall; at most the length of a profile, which stands for solid bone.
     error_mm: Standard error of the shift.
+    spread_mm: That error without what coarse voxels add, by which neighbours are weighed.
     room_mm: From the vertex outwards to the next wall, or to the end of the profile.
     """
 
@@ -98,6 +104,7 @@ class CortexFit:
     shift_mm: Float32Array
     thickness_mm: Float32Array
     error_mm: Float32Array
+    spread_mm: Float32Array
     room_mm: Float32Array
 
     def counts(self) -> dict[str, int]:
@@ -129,13 +136,14 @@ def fit_walls(
         groups = find_groups(sampler, resident.volume, points, normals, components, constants)
     levels = tuple(known.cortex_hu for _, known in groups[1:])
     marks = np.empty(count, np.uint8), np.empty(count, bool)
-    fit = CortexFit(constants, levels, *marks, *(np.empty(count, np.float32) for _ in range(4)))
+    fit = CortexFit(constants, levels, *marks, *(np.empty(count, np.float32) for _ in range(5)))
     steep = np.square(normals @ sampler.frame.normal)
     for members, known in groups:
         for piece, values_d in sampler.pieces(points[members], normals[members]):
             rows = members[piece]
             with stopwatch.running(resident.device):
-                walls = WallProfiles(sampler, values_d, len(rows)).fit_with(known)
+                profiles = WallProfiles(sampler, values_d, len(rows))
+                walls, frames = profiles.fit_with(known), profiles.frames()
             within, across = known.blur_mm**2, known.blur_across_mm**2
             blurs = np.sqrt(within + (across - within) * steep[rows])
             hidden = (blurs > _ACROSS * known.blur_mm) & (walls.thickness_mm < _HIDDEN_BLURS * blurs)
@@ -143,7 +151,10 @@ def fit_walls(
             fit.hidden[rows] = hidden & (fit.states[rows] == _BADLY_FITTED)
             fit.shift_mm[rows], fit.thickness_mm[rows] = walls.shift_mm, walls.thickness_mm
             fit.room_mm[rows] = walls.room_mm
-            fit.error_mm[rows] = standard_errors(walls, known)
+            fit.spread_mm[rows] = standard_errors(walls, known)
+            steps = sampler.frame.steps_along(normals[rows], frames[1])
+            ratios = steps / blurs_of(frames, known.blur_mm, known.blur_across_mm)
+            fit.error_mm[rows] = standard_errors(walls, known, coarse_mm=steps * ratios * ratios)
     return fit
 
 
@@ -164,17 +175,24 @@ def judge_walls(
     return states
 
 
-def standard_errors(walls: WallFits, constants: CortexConstants) -> Float32Array:
-    """Return the standard errors of shifts, mm: noise, what the model leaves, and the constants'.
+def standard_errors(
+    walls: WallFits, constants: CortexConstants, *, coarse_mm: Float32Array | None = None
+) -> Float32Array:
+    """Return the standard errors of shifts, mm: noise, what the model leaves, the constants' and coarse voxels'.
 
     Where the cortex differs from that of the scan by more than it may, the error grows by the ratio.
+
+    coarse_mm: ndarray, shape (n,). step^3 / blur^2; None: the errors by which neighbours are weighed.
     """
+    factor, least = (_WEIGHT_FACTOR, _LEAST_WEIGHED) if coarse_mm is None else (_ERROR_FACTOR, _LEAST_ERROR)
     explained = unexplained_hu(constants.cortex_hu, constants.known_noise)
     left = np.maximum(walls.residual_hu, np.float32(explained)) * np.float32(np.sqrt(CORRELATED_MM / STEP_MM))
-    least = np.float32(_LEAST_ERROR * constants.blur_mm)
     differs = np.abs(walls.cortex_hu - constants.cortex_hu) / (constants.cortex_spread * constants.cortex_hu)
     factors = np.maximum(differs, 1.0).astype(np.float32)
-    return factors * np.hypot(np.float32(_ERROR_FACTOR) * np.sqrt(walls.shift_variance) * left, least)
+    errors = np.hypot(np.float32(factor) * np.sqrt(walls.shift_variance) * left, np.float32(least * constants.blur_mm))
+    if coarse_mm is not None:
+        errors = np.hypot(errors, np.float32(_COARSE_ERROR) * coarse_mm)
+    return factors * errors
 
 
 _MOST_LOOKED_AT = 20_000
@@ -237,7 +255,7 @@ def choose_shifts(fit: CortexFit, triangles: NDArray[np.uint32], fans: Fans) -> 
     """
     fitted, doubtful = fit.states == FITTED, np.flatnonzero(fit.states == _BADLY_FITTED)
     shifts = np.where(fitted, fit.shift_mm, 0.0).astype(np.float32)
-    weights = np.where(fitted, 1.0 / np.square(np.maximum(fit.error_mm, 1e-3)), 0.0)
+    weights = np.where(fitted, 1.0 / np.square(np.maximum(fit.spread_mm, 1e-3)), 0.0)
     for _ in range(_RINGS):
         weight, weighted = fans.sums(np.column_stack([weights, weights * shifts]), triangles, doubtful).T
         is_known = weight > 0.0

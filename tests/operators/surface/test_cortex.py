@@ -13,7 +13,7 @@ from clrecon.geometry import Volume
 from clrecon.opencl import Stopwatch
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface import cortex
-from clrecon.operators.surface.cortex import CortexConstants, ProfileSampler, ProfileScale, WallFits
+from clrecon.operators.surface.cortex import CortexConstants, ProfileSampler, ProfileScale, StackFrame, WallFits
 from clrecon.operators.surface.cortex_constants import MOST_WALLS
 from clrecon.operators.surface.cortex_mesh import (
     _STATES,
@@ -87,6 +87,32 @@ def test_errors_of_a_fitted_shell_hold_nine_tenths_of_its_distances_from_the_tru
     _, mesh, fit = fitted_shell
     away, rows = outer_places(mesh, fit)
     assert (np.abs(away) < 1.96 * fit.error_mm[rows]).mean() > 0.9  # measured 1
+
+
+def test_errors_in_voxels_coarse_beside_the_blur_hold_the_distances_from_the_truth(device):
+    """A blur of 0.3 mm in voxels of 1 mm: interpolation between them blurs by more than the scan does."""
+    mesh, fit = fit_surface(hollow_ball(thickness=3.0, blur=0.3), device)
+    away, rows = outer_places(mesh, fit)
+    assert (np.abs(away) < 1.96 * fit.error_mm[rows]).mean() > 0.95  # measured 1; 0.84 by the spread alone
+    assert (np.abs(away) < 1.96 * fit.spread_mm[rows]).mean() < 0.9
+
+
+def test_walls_across_thick_slices_have_larger_errors_than_walls_along_them(device):
+    """Slices of 2 mm, a blur of 0.5 mm."""
+    mesh, fit = fit_surface(hollow_ball(thickness=3.0, blur=0.5, spacing=(1.0, 1.0, 2.0)), device)
+    _, rows = outer_places(mesh, fit)
+    along_axis = np.abs(mesh.normals[rows, 2])
+    across, within = (np.median(fit.error_mm[rows][chosen]) for chosen in (along_axis > 0.9, along_axis < 0.3))
+    assert across > 2.5 * within  # measured 3.3; 1.6 by the spread alone
+
+
+def test_voxels_lie_as_far_apart_along_a_normal_as_their_axes_and_gaps_say():
+    """Voxels of 0.7 x 0.9 x 2 mm; between two of the slices the gap is twice as large, so its square is 4."""
+    volume = hollow_ball(spacing=(0.7, 0.9, 2.0))
+    diagonal = np.sqrt(0.5) * np.array([1.0, 1.0, 0.0])
+    steps = StackFrame(volume).steps_along(np.stack([*np.eye(3), -np.eye(3)[2], diagonal]), np.array([1, 1, 1, 4, 1]))
+    # Half the square of each axis' step, squared and added.
+    np.testing.assert_allclose(steps, [0.7, 0.9, 2.0, 4.0, (0.7**4 / 4 + 0.9**4 / 4) ** 0.25], rtol=1e-6)  # float32
 
 
 def test_constants_are_the_blur_and_density_of_the_scan(device):

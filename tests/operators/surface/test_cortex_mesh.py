@@ -126,9 +126,9 @@ def test_hidden_walls_follow_their_fitted_neighbours_three_vertices_far_and_othe
     corner = (9 * rows + columns)[:8, :8].ravel()
     triangles = np.concatenate([corner[:, None] + [0, 1, 10], corner[:, None] + [0, 10, 9]]).astype(np.uint32)
     states = np.where(columns < 3, 0, 3).astype(np.uint8).ravel()
-    shift, error = np.where(states == 0, -0.5, 9.0).astype(np.float32), np.full(81, 0.1, np.float32)
-    hidden = (states == 3) & (rows < 5).ravel()
-    fit = CortexFit(None, (), states, hidden, shift, error, error, error)
+    shift, spread = np.where(states == 0, -0.5, 9.0).astype(np.float32), np.full(81, 0.1, np.float32)
+    hidden, unused = (states == 3) & (rows < 5).ravel(), np.full(81, np.nan, np.float32)
+    fit = CortexFit(None, (), states, hidden, shift, unused, unused, spread, unused)
 
     shifts = choose_shifts(fit, triangles, Fans(triangles, 81)).reshape(9, 9)
 
