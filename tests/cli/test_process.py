@@ -8,19 +8,21 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 from ct_files import write_series
+from house import ROOT
 
 COMMAND = [sys.executable, "-m", "clrecon.cli.main"]
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
 
 
-def run(*arguments: str, **options: object) -> subprocess.CompletedProcess[str]:
-    root = Path(__file__).resolve().parents[2]
-    environment = {**os.environ, "PYTHONPATH": str(root), **options.pop("environment", {})}  # type: ignore[dict-item]
+def run(*arguments: str, stdout: Any = subprocess.PIPE, **variables: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [*COMMAND, *arguments], env=environment, capture_output=True, text=True, timeout=120, **options
-    )  # type: ignore[call-overload]
+        [*COMMAND, *arguments],
+        env=ENVIRONMENT | variables, stdout=stdout, stderr=subprocess.PIPE, text=True, timeout=120,
+    )  # fmt: skip
 
 
 def test_help_is_on_standard_output_within_three_seconds() -> None:
@@ -33,7 +35,7 @@ def test_help_is_on_standard_output_within_three_seconds() -> None:
 
 
 def test_help_imports_neither_numpy_nor_a_driver() -> None:
-    done = run("mesh", "--help", environment={"PYTHONPROFILEIMPORTTIME": "1"})
+    done = run("mesh", "--help", PYTHONPROFILEIMPORTTIME="1")
     imported = {line.rpartition("|")[2].strip().partition(".")[0] for line in done.stderr.splitlines()}
     assert "argparse" in imported
     assert imported & {"numpy", "pydicom", "pyopencl", "vtk", "vtkmodules", "pyvista", "skimage", "scipy"} == set()
@@ -51,37 +53,22 @@ def test_reader_that_leaves_early_is_no_error(tmp_path: Path) -> None:
     write_series(tmp_path / "ct")
     reading, writing = os.pipe()
     os.close(reading)
-    root = Path(__file__).resolve().parents[2]
-    process = subprocess.run(
-        [*COMMAND, "info", str(tmp_path / "ct")],
-        env={**os.environ, "PYTHONPATH": str(root)},
-        stdout=writing,
-        stderr=subprocess.PIPE,
-        timeout=60,
-    )
+    done = run("info", str(tmp_path / "ct"), stdout=writing)
     os.close(writing)
-    assert (process.returncode, process.stderr) == (0, b"")
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
 def test_process_with_a_full_disk_behind_standard_output_ends_with_6(tmp_path: Path) -> None:
     write_series(tmp_path / "ct")
-    root = Path(__file__).resolve().parents[2]
     with open("/dev/full", "w") as full:
-        process = subprocess.run(
-            [*COMMAND, "info", str(tmp_path / "ct"), "--json"],
-            env={**os.environ, "PYTHONPATH": str(root)},
-            stdout=full,
-            stderr=subprocess.PIPE,
-            text=True,
-            timeout=60,
-        )
-    assert process.returncode == 6
-    assert process.stderr == "clrecon: error: cannot write to standard output: No space left on device\n"
+        done = run("info", str(tmp_path / "ct"), "--json", stdout=full)
+    assert done.returncode == 6
+    assert done.stderr == "clrecon: error: cannot write to standard output: No space left on device\n"
 
 
 def test_letters_that_a_plain_locale_has_not_are_printed_as_codes(tmp_path: Path) -> None:
-    done = run("info", str(tmp_path / "größe"), environment={"PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"})
+    done = run("info", str(tmp_path / "größe"), PYTHONIOENCODING="ascii", PYTHONUTF8="0")
     assert done.returncode == 2
     assert "gr\\xf6\\xdfe" in done.stderr
 
@@ -89,10 +76,9 @@ def test_letters_that_a_plain_locale_has_not_are_printed_as_codes(tmp_path: Path
 @pytest.mark.skipif(os.name != "posix", reason="pipes and signals of POSIX")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)])
 def test_interrupted_phantom_ends_with_130_and_leaves_no_files(number: signal.Signals, tmp_path: Path) -> None:
-    root = Path(__file__).resolve().parents[2]
     process = subprocess.Popen(
         [*COMMAND, "phantom", str(tmp_path / "ph"), "--slices", "300", "-v"],
-        env={**os.environ, "PYTHONPATH": str(root)},
+        env=ENVIRONMENT,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -111,12 +97,11 @@ def test_pillow_is_imported_by_render_and_not_by_info(tmp_path: Path) -> None:
     write_series(tmp_path / "ct")
     told = "import sys; print(sys.modules.get('PIL') is not None, flush=True)"
     code = f"import atexit; from clrecon.cli import main; atexit.register(lambda: exec({told!r})); main.run()"
-    root = Path(__file__).resolve().parents[2]
     found = []
     for command in (["info"], ["render", "-o", str(tmp_path / "a.png"), "--size", "32", "-q"]):
         done = subprocess.run(
             [sys.executable, "-c", code, *command, str(tmp_path / "ct")],
-            env={**os.environ, "PYTHONPATH": str(root)},
+            env=ENVIRONMENT,
             capture_output=True,
             text=True,
             timeout=120,

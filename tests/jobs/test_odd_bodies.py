@@ -346,24 +346,31 @@ def test_surface_of_a_range_of_hu_lies_on_the_material_with_these_values(
     assert share_near(odd[name], vertices, *materials) > 0.9  # measured 0.998 and 1
 
 
+PRINT_WITHOUT_TABLE = settings_for("print", {"iso_value": 300.0, "remove_table": True})
+
+
+@pytest.fixture(scope="module")
+def printed_pair(odd: OddBodies, device: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, np.ndarray]:
+    """Report and vertices of a print of a pair of legs, of which it has one."""
+    return mesh_of(odd, device, tmp_path_factory.mktemp("pair"), "pair", **PRINT_WITHOUT_TABLE)
+
+
 @pytest.mark.parametrize("name", daily(1, ("pair", "limb")))
 def test_print_without_the_table_is_one_closed_piece_of_bone(
-    odd: OddBodies, device: Any, tmp_path: Path, name: str
+    odd: OddBodies, device: Any, tmp_path: Path, name: str, request: pytest.FixtureRequest
 ) -> None:
-    settings = settings_for("print", {"iso_value": 300.0, "remove_table": True})
-
-    report, vertices = mesh_of(odd, device, tmp_path, name, **settings)
+    if name == "pair":
+        report, vertices = request.getfixturevalue("printed_pair")
+    else:
+        report, vertices = mesh_of(odd, device, tmp_path, name, **PRINT_WITHOUT_TABLE)
 
     assert (report["closed"], report["components"]) == (True, 1)
     assert share_near(odd[name], vertices, "bone", "metal") > 0.9  # measured 0.98 of both
     assert all(gate["ok"] for gate in report["gates"] if gate["name"] in ("bone_kept", "watertight"))
 
 
-def test_print_of_one_leg_of_a_pair_warns_of_the_other(odd: OddBodies, device: Any, tmp_path: Path) -> None:
-    settings = settings_for("print", {"iso_value": 300.0, "remove_table": True})
-
-    report, _ = mesh_of(odd, device, tmp_path, "pair", **settings)
-
+def test_print_of_one_leg_of_a_pair_warns_of_the_other(printed_pair: tuple[dict, np.ndarray]) -> None:
+    report, _ = printed_pair
     assert report["print"]["left_out"]["pieces_ml"] > 0.0
     assert any("left out" in warning for warning in report["warnings"])
 

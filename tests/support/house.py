@@ -15,92 +15,35 @@ LEFT_OF: dict[str, frozenset[str]] = {}
 """For each layer (a module or folder of clrecon/) the layers that it may import."""
 
 
-def _layer(name: str, *allowed: str) -> None:
-    LEFT_OF[name] = frozenset(allowed)
+def _layer(name: str, allowed: str = "") -> None:
+    LEFT_OF[name] = frozenset(allowed.split())
 
 
 _layer("errors")
 _layer("version")
 _layer("system", "errors")
-_layer("opencl", "errors", "version", "system")
-_layer("geometry", "errors", "system")
-_layer("anatomy", "errors", "system", "geometry")
-_layer("exchange", "errors", "version", "system", "geometry")
-_layer("reading", "errors", "system", "geometry", "exchange")
-_layer("labels", "errors", "version", "system", "geometry", "reading")
-_layer("spine", "errors", "system", "geometry", "anatomy", "labels")
-_layer("mesh", "errors", "system", "geometry", "anatomy", "exchange")
-_layer("points", "errors", "system", "geometry", "exchange")
-_layer("rendering", "errors", "version", "system", "geometry", "labels")
-_layer("operators", "errors", "system", "opencl", "geometry", "anatomy", "labels", "mesh", "points", "rendering")
+_layer("opencl", "errors version system")
+_layer("geometry", "errors system")
+_layer("anatomy", "errors system geometry")
+_layer("exchange", "errors version system geometry")
+_layer("reading", "errors system geometry exchange")
+_layer("labels", "errors version system geometry reading")
+_layer("spine", "errors system geometry anatomy labels")
+_layer("mesh", "errors system geometry anatomy exchange")
+_layer("points", "errors system geometry exchange")
+_layer("rendering", "errors version system geometry labels")
+_layer("operators", "errors system opencl geometry anatomy labels mesh points rendering")
 _layer(
     "jobs",
-    "errors",
-    "version",
-    "system",
-    "opencl",
-    "geometry",
-    "anatomy",
-    "exchange",
-    "reading",
-    "labels",
-    "spine",
-    "mesh",
-    "points",
-    "rendering",
-    "operators",
+    "errors version system opencl geometry anatomy exchange reading labels spine mesh points rendering operators",
 )
-_layer(
-    "viewer",
-    "errors",
-    "system",
-    "opencl",
-    "geometry",
-    "anatomy",
-    "exchange",
-    "reading",
-    "labels",
-    "mesh",
-    "points",
-    "rendering",
-    "operators",
-    "jobs",
-)
-_layer(
-    "proof",
-    "errors",
-    "version",
-    "system",
-    "opencl",
-    "geometry",
-    "exchange",
-    "reading",
-    "labels",
-    "mesh",
-    "points",
-    "rendering",
-    "operators",
-    "jobs",
-)
-_layer("cli", "errors", "version", "system", "jobs", "viewer", "proof")
+_layer("viewer", "errors system opencl geometry anatomy exchange reading labels mesh points rendering operators jobs")
+_layer("proof", "errors version system opencl geometry exchange reading labels mesh points rendering operators jobs")
+_layer("cli", "errors version system jobs viewer proof")
 _layer("__main__", "cli")
 _layer(
     "__init__",
-    "errors",
-    "version",
-    "system",
-    "opencl",
-    "geometry",
-    "anatomy",
-    "reading",
-    "labels",
-    "spine",
-    "mesh",
-    "points",
-    "rendering",
-    "operators",
-    "viewer",
-    "proof",
+    "errors version system opencl geometry anatomy reading labels spine mesh points rendering operators viewer proof",
 )
 
 # Third-party packages: at module level (paid by whoever imports the layer), or only inside functions.
