@@ -15,14 +15,7 @@ from clrecon.jobs.mesh.bone import judge_surfaces, warn_of_walls
 from clrecon.jobs.mesh.labels import describe_label, judge_label_volumes, name_label_files
 from clrecon.jobs.mesh.make import MadeParts, first_names, label_parts, make_parts, warn_of_crumbs
 from clrecon.jobs.mesh.purposes import describe_purposes
-from clrecon.jobs.mesh.refinement import (
-    judge_parts,
-    measure_parts,
-    place_on_cortex,
-    refine_surface,
-    warn_of_gates,
-    warn_of_shift,
-)
+from clrecon.jobs.mesh.refinement import judge_parts, place_on_cortex, refine_and_measure, warn_of_gates, warn_of_shift
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part, describe_level, plan_surfaces
 from clrecon.jobs.outputs import check_kept, check_outputs, count_leftovers, name_outputs, refuse_files, refuse_numbered
@@ -342,14 +335,7 @@ def _refine_and_measure(run: Run, result: MadeParts, measure: bool) -> list[dict
     settings: MeshSettings = run.settings
     place_on_cortex(result, settings, measure, run.progress)
     run.lap("cortex")
-    if settings.refines:
-        for part in result.parts:
-            part.mesh = refine_surface(part.mesh, settings, result.device, run.progress)
-        run.lap("refine")
-    if measure:
-        measure_parts(
-            result.parts, result.solid([part.mesh for part in result.parts]), settings, result.device, run.progress
-        )
+    refine_and_measure(result, settings, measure, run.lap, run.progress)
     gates = judge_parts(result.parts, settings)
     return gates + (judge_label_volumes(result.parts, settings.closed) if settings.labels_pick else [])
 

@@ -56,7 +56,8 @@ def settings_for(name: str | None, given: dict[str, Any]) -> dict[str, Any]:
 
 def _without_parts(given: dict[str, Any]) -> MeshSettings:
     """Return the settings of these fields without those that a purpose alone makes valid."""
-    return MeshSettings(**{name: value for name, value in given.items() if name not in ("all_parts", "seal_mm")})
+    others = ("all_parts", "seal_mm", "max_deviation_mm")
+    return MeshSettings(**{name: value for name, value in given.items() if name not in others})
 
 
 def _are_hollow(given: dict[str, Any]) -> bool:

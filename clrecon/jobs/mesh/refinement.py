@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -22,20 +22,28 @@ if TYPE_CHECKING:
     from clrecon.jobs.mesh.make import MadeParts
     from clrecon.mesh import Mesh
     from clrecon.opencl import Device
+    from clrecon.system.records import Gate
 
 
 _SHIFT_SHARE, _FEWEST_TOLD = 0.1, 0.5
 """A level that changes the volume by this share is warned of, where so much of the surface has told."""
 
 
-_PRINT_BOUND = 0.8
-"""Of the default bound, for decimation of prints: of a few hundred vertices more than 5 % lie near the bound, and the
-gate of 0.25 voxel at 95 % of the surface failed at 0.9.
+_PRINT_BOUNDS = (0.8, 0.5, 0.2)
+"""Of the default bound, for decimation of prints, in turn until the distances pass their gates: how much of these the
+smoothing leaves is only known once it is measured.  The first is enough for most scans.
 """
 
+_JUDGED_AS_FAR = ("iso_distance_p95", "iso_distance_mean", "deviation_p95", "deviation_mean")
 
-def refine_surface(mesh: Mesh, settings: MeshSettings, device: Device, progress: Progress = ignore_progress) -> Mesh:
-    """Smooth and decimate as asked; else return the mesh itself.  Where memory is limited, the host smooths."""
+
+def refine_surface(
+    mesh: Mesh, settings: MeshSettings, device: Device, progress: Progress = ignore_progress, turn: int = 0
+) -> Mesh:
+    """Smooth and decimate as asked; else return the mesh itself.  Where memory is limited, the host smooths.
+
+    turn: Which of `_PRINT_BOUNDS` holds, where a print has no bound of its own.
+    """
     if not settings.refines:
         return mesh
     from clrecon.mesh.compare.distances import compare_meshes
@@ -52,8 +60,8 @@ def refine_surface(mesh: Mesh, settings: MeshSettings, device: Device, progress:
     if share is not None and settings.method == "g-mc":
         mesh = collapse_quadric(mesh, share, progress=progress)
     elif share is not None:
-        if bound is None and settings.is_for_print:
-            bound = _PRINT_BOUND * default_deviation(raw)
+        if _is_tightened(settings):
+            bound = _PRINT_BOUNDS[turn] * default_deviation(raw)
         mesh = decimate_mesh(mesh, share, bound, device=device, memory=settings.memory, progress=progress)
     mesh.report["refinement"] |= {
         "deviation": compare_meshes(mesh, raw, progress=progress),
@@ -152,6 +160,46 @@ def _measure_size(part: Part) -> tuple[float, float]:
     return part.quality.area_mm2, 1000.0 * (part.quality.volume_ml or 0.0)
 
 
+def refine_and_measure(
+    result: MadeParts,
+    settings: MeshSettings,
+    measure: bool,
+    lap: Callable[[str], object],
+    progress: Progress = ignore_progress,
+) -> None:
+    """Refine the parts and, if asked, measure them: of a print those that lie too far again, within a tighter bound.
+
+    lap: Called with the name of each stage that is done.
+    """
+    turns = len(_PRINT_BOUNDS) if _is_tightened(settings) else 1
+    parts = result.parts
+    for turn in range(turns):
+        extracted = [part.mesh for part in parts] if turn + 1 < turns else []
+        if settings.refines:
+            for part in parts:
+                part.mesh = refine_surface(part.mesh, settings, result.device, progress, turn)
+            lap("refine")
+        if measure:
+            measure_parts(parts, result.solid([part.mesh for part in parts]), settings, result.device, progress)
+            lap("measure")
+        again = [(part, mesh) for part, mesh in zip(parts, extracted, strict=False) if _lies_too_far(part, settings)]
+        for part, mesh in again:
+            part.mesh = mesh
+        parts = [part for part, _ in again]
+        if not parts:
+            break
+
+
+def _is_tightened(settings: MeshSettings) -> bool:
+    """Tell whether the bound of decimation follows from the gates."""
+    bounded = settings.decimate_used is not None and settings.method != "g-mc"
+    return settings.is_for_print and bounded and settings.max_deviation_mm is None
+
+
+def _lies_too_far(part: Part, settings: MeshSettings) -> bool:
+    return any(gate.ok is False for gate in _judge_part(part, settings) if gate.name in _JUDGED_AS_FAR)
+
+
 def measure_parts(
     parts: Sequence[Part],
     volume: Volume,
@@ -206,24 +254,26 @@ def judge_parts(parts: Sequence[Part], settings: MeshSettings) -> list[dict[str,
         for part in parts:
             part.facts |= {"iso_distance": None, "refinement": None}
         return []
-    from clrecon.mesh.compare.mesh_gates import judge_mesh
-
     gates = []
     for part in parts:
-        refinement = part.mesh.report.get("refinement")
-        iso_distance = part.facts.get("iso_distance")
-        gates_of_part = judge_mesh(
-            part.quality,
-            closed=settings.closed,
-            outward=not settings.split,
-            iso_distance=iso_distance,
-            extracted=not refinement,
-            deviation=refinement and refinement["deviation"],
-            voxel_mm=refinement and refinement["voxel_mm"],
-        )
-        part.facts |= {"iso_distance": iso_distance, "refinement": refinement}
-        gates += [{"mesh": part.name or None, **gate} for gate in gates_of_part]
+        gates += [{"mesh": part.name or None, **gate} for gate in _judge_part(part, settings)]
+        part.facts |= {"iso_distance": part.facts.get("iso_distance"), "refinement": part.mesh.report.get("refinement")}
     return gates
+
+
+def _judge_part(part: Part, settings: MeshSettings) -> list[Gate]:
+    from clrecon.mesh.compare.mesh_gates import judge_mesh
+
+    refinement = part.mesh.report.get("refinement")
+    return judge_mesh(
+        part.quality,
+        closed=settings.closed,
+        outward=not settings.split,
+        iso_distance=part.facts.get("iso_distance"),
+        extracted=not refinement,
+        deviation=refinement and refinement["deviation"],
+        voxel_mm=refinement and refinement["voxel_mm"],
+    )
 
 
 def _count_crossings(mesh: Mesh, device: Device | None, steps: Steps) -> int:

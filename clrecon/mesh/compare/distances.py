@@ -75,12 +75,18 @@ class DistanceSummary(Record):
     max: float
 
 
-def summarise_distances(distances: NDArray[np.float64]) -> DistanceSummary:
-    """Sum up distances, shape (n,), at least one."""
+def summarise_distances(distances: NDArray[np.float64], weights: NDArray[np.float64] | None = None) -> DistanceSummary:
+    """Sum up distances, shape (n,), at least one; `weights`, above 0, are the areas that they stand for."""
+    if weights is None:
+        p95 = float(np.percentile(distances, 95))
+    else:
+        order = np.argsort(distances)
+        up_to = np.cumsum(weights[order])
+        p95 = float(distances[order[np.searchsorted(up_to, 0.95 * up_to[-1])]])
     return DistanceSummary(
-        float(distances.mean()),
-        float(np.sqrt(np.mean(distances * distances))),
-        float(np.percentile(distances, 95)),
+        float(np.average(distances, weights=weights)),
+        float(np.sqrt(np.average(distances * distances, weights=weights))),
+        p95,
         float(distances.max()),
     )
 

@@ -14,8 +14,9 @@ from clrecon.geometry import METAL_HU, Volume
 from clrecon.geometry.iso_rule import IsoRule, layer_normal_matrices
 from clrecon.mesh.compare.distances import DistanceSummary, summarise_distances
 from clrecon.mesh.mesh import Mesh
+from clrecon.mesh.triangles import cross_products
 from clrecon.system.light_dataclass import dataclass
-from clrecon.system.pieces import chunks
+from clrecon.system.pieces import chunks, local_origin
 from clrecon.system.records import Record
 
 SAMPLES = 100_000
@@ -23,6 +24,9 @@ SAMPLES = 100_000
 
 _METAL_REACH = 2
 """Voxels: at metal a level of bone lies in the outermost ones; the surface is a staircase, which smoothing leaves."""
+
+_AT_A_CORNER = 1.0 / 12.0
+"""Share of the area of a triangle at each corner, the rest at its centre: exact where the distance is quadratic."""
 
 _STEPS = 12
 _ON_THE_SURFACE = 1e-3
@@ -209,13 +213,15 @@ def _distances_along_lines(volume: Volume, rule: IsoRule, level: float, points: 
 class IsoDistance(Record):
     """How far a mesh lies from the trilinear iso surface, in mm and in units of `voxel_mm`, the shortest voxel step.
 
+    Means and percentiles are of the area: what counts is that of the triangle, or of those around a vertex.
+
     samples: ``vertices`` and ``centres`` that were measured.
     not_found: Points from which no surface was reached; the figures are of the others.
-    near_metal: Measured vertices within `_METAL_REACH` voxels of a voxel above `METAL_HU`.
     surface_voxel: Of vertices and centres together: decimation leaves vertices outside of what is round, and centres
         inside, so that neither alone is how far the surface lies.
-    away_from_metal_voxel: Without those near metal, of vertices or of both, whichever is nearer; None where these are
-        none, or more than half.
+    near_metal_share: Share of the area within `_METAL_REACH` voxels of a voxel above `METAL_HU`.
+    away_from_metal_voxel: Without what is near metal, of vertices or of both, whichever is nearer; None where that is
+        nothing, or more than half.
     """
 
     voxel_mm: float
@@ -226,7 +232,7 @@ class IsoDistance(Record):
     centres_mm: DistanceSummary | None
     centres_voxel: DistanceSummary | None
     surface_voxel: DistanceSummary | None
-    near_metal: int = 0
+    near_metal_share: float = 0.0
     away_from_metal_voxel: DistanceSummary | None = None
 
 
@@ -242,54 +248,72 @@ def measure_iso_distances(
     samples: Most vertices and triangles of a mesh that are measured; of more, every n-th.
     """
     result: list[IsoDistance] = []
-    waiting: list[Float64Array] = []
+    waiting: list[_Points] = []
     for number, mesh in enumerate(meshes, start=1):
-        triangles = mesh.triangles[:: -(-mesh.triangle_count // samples) or 1]
-        waiting.append(mesh.vertices[:: -(-mesh.vertex_count // samples) or 1].astype(np.float64))
-        waiting.append(mesh.vertices[triangles].mean(axis=1, dtype=np.float64))
-        if number == len(meshes) or sum(map(len, waiting)) >= samples:
-            distances = distances_to_iso_surface(volume, rule, np.concatenate(waiting))
-            near = _find_near_metal(volume, rule, np.concatenate(waiting))
-            parts, marks = _split_as(waiting, distances), _split_as(waiting, near)
-            result += map(partial(_sum_up, smallest_voxel_mm(volume)), parts[::2], parts[1::2], marks[::2], marks[1::2])
+        waiting.append(_Points.of(mesh, samples))
+        if number == len(meshes) or sum(len(each.places) for each in waiting) >= samples:
+            places = np.concatenate([each.places for each in waiting])
+            ends = np.cumsum([len(each.places) for each in waiting])[:-1]
+            distances = np.split(distances_to_iso_surface(volume, rule, places), ends)
+            near_metal = np.split(_find_near_metal(volume, rule, places), ends)
+            result += map(partial(_sum_up, smallest_voxel_mm(volume)), waiting, distances, near_metal)
             waiting.clear()
     return result
 
 
-def _split_as(points: Sequence[Float64Array], values: NDArray[Any]) -> list[NDArray[Any]]:
-    """Split values of points that were joined into those of each."""
-    return np.split(values, np.cumsum([len(each) for each in points])[:-1])
+@dataclass(frozen=True, eq=False)
+class _Points:
+    """Vertices of a mesh and, after them, centres of triangles, with the area that each stands for."""
+
+    places: Float64Array
+    areas: Float64Array
+    vertex_count: int
+
+    @classmethod
+    def of(cls, mesh: Mesh, most: int) -> _Points:
+        """Take every n-th, at most so many of both; in a mesh without area all stand for the same."""
+        twice = np.ones(mesh.triangle_count)
+        for piece, _, cross in cross_products(mesh.vertices, mesh.triangles, local_origin(mesh.vertices)):
+            twice[piece] = np.sqrt(np.einsum("ij,ij->j", cross, cross))
+        of_triangles = 0.5 * twice if twice.any() else np.ones(len(twice))
+        at_corners = np.repeat(of_triangles * _AT_A_CORNER, 3)
+        of_vertices = np.bincount(mesh.triangles.reshape(-1), at_corners, minlength=mesh.vertex_count)
+        by_vertices, by_triangles = (-(-count // most) or 1 for count in (mesh.vertex_count, mesh.triangle_count))
+        centres = mesh.vertices[mesh.triangles[::by_triangles]].mean(axis=1, dtype=np.float64)
+        both = np.concatenate([mesh.vertices[::by_vertices].astype(np.float64), centres])
+        at_centres = (1.0 - 3.0 * _AT_A_CORNER) * of_triangles
+        areas = np.concatenate([by_vertices * of_vertices[::by_vertices], by_triangles * at_centres[::by_triangles]])
+        return cls(both, areas, len(both) - len(centres))
 
 
-def _sum_up(
-    voxel: float, of_vertices: Float64Array, of_centres: Float64Array, *near_metal: NDArray[Any]
-) -> IsoDistance:
-    count, near = int(np.count_nonzero(near_metal[0])), np.concatenate(near_metal)
-    both = np.concatenate([of_vertices, of_centres])
-    away = None
-    if 0 < 2 * count <= len(of_vertices):
-        known = _summarise(of_vertices[~near_metal[0]], voxel), _summarise(both[~near], voxel)
+def _sum_up(voxel: float, points: _Points, distances: Float64Array, near_metal: NDArray[np.bool_]) -> IsoDistance:
+    count, areas = points.vertex_count, points.areas
+    vertices, centres = slice(count), slice(count, None)
+    share, away = float(areas[near_metal].sum() / (areas.sum() or 1.0)), None
+    if 0.0 < share <= 0.5:
+        clear = np.where(near_metal, np.nan, distances)
+        known = (_summarise(clear[part], areas[part], voxel) for part in (vertices, slice(None)))
         away = min(filter(None, known), key=lambda one: one.mean, default=None)
     return IsoDistance(
         voxel,
-        {"vertices": len(of_vertices), "centres": len(of_centres)},
-        int(np.count_nonzero(~np.isfinite(both))),
-        vertices_mm=_summarise(of_vertices),
-        vertices_voxel=_summarise(of_vertices, voxel),
-        centres_mm=_summarise(of_centres),
-        centres_voxel=_summarise(of_centres, voxel),
-        surface_voxel=_summarise(both, voxel),
-        near_metal=count,
+        {"vertices": count, "centres": len(distances) - count},
+        int(np.count_nonzero(~np.isfinite(distances))),
+        vertices_mm=_summarise(distances[vertices], areas[vertices]),
+        vertices_voxel=_summarise(distances[vertices], areas[vertices], voxel),
+        centres_mm=_summarise(distances[centres], areas[centres]),
+        centres_voxel=_summarise(distances[centres], areas[centres], voxel),
+        surface_voxel=_summarise(distances, areas, voxel),
+        near_metal_share=share,
         away_from_metal_voxel=away,
     )
 
 
-def _summarise(distances: Float64Array, unit_mm: float = 1.0) -> DistanceSummary | None:
-    """Sum up the finite distances, None without one."""
-    known = distances[np.isfinite(distances)]
-    if len(known) == 0:
+def _summarise(distances: Float64Array, areas: Float64Array, unit_mm: float = 1.0) -> DistanceSummary | None:
+    """Sum up the finite distances by the area that each stands for, None without any."""
+    known = np.isfinite(distances) & (areas > 0.0)
+    if not known.any():
         return None
-    return DistanceSummary(*(value / unit_mm for value in summarise_distances(known).values()))
+    return DistanceSummary(*(value / unit_mm for value in summarise_distances(distances[known], areas[known]).values()))
 
 
 def _find_near_metal(volume: Volume, rule: IsoRule, points: Float64Array) -> NDArray[np.bool_]:

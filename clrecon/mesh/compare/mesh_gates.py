@@ -9,7 +9,7 @@ from clrecon.geometry import METAL_HU
 from clrecon.system.records import Gate, at_most, is_true, none_of, unmeasured
 
 _DEVIATION_P95_VOXEL = 0.25
-"""Bound for 95 % of the surface, in shortest voxel steps."""
+"""Bound for 95 % of the surface, by its area, in shortest voxel steps."""
 
 DEVIATION_MEAN_VOXEL = 0.1
 _VOLUME_CHANGE_PERCENT = 0.5
@@ -93,12 +93,11 @@ def _gates_of_iso_distance(iso_distance: Mapping[str, Any], extracted: bool) -> 
     measures = (("p95", _DEVIATION_P95_VOXEL, "95 % of it"), ("mean", DEVIATION_MEAN_VOXEL, "mean"))
     known = [iso_distance.get(name) for name in ("vertices_voxel", *["surface_voxel"] * (not extracted))]
     clear = min(filter(None, known), key=lambda one: float(one["mean"]), default=None)
-    near, away = iso_distance.get("near_metal", 0), None if extracted else iso_distance.get("away_from_metal_voxel")
-    of = f"of {iso_distance['samples']['vertices']:,} vertices" if near else ""
-    metal = f"{near:,} {of} near metal (above {METAL_HU:g} HU)" if near else ""
+    near, away = iso_distance.get("near_metal_share"), None if extracted else iso_distance.get("away_from_metal_voxel")
+    metal = f"{100.0 * near:.2g} % of the surface near metal (above {METAL_HU:g} HU)" if near else ""
     for name, bound, which in measures:
         if clear and away:
-            aside = f"without {metal}, with them {clear[name]:.3g}"
+            aside = f"without {metal}, with it {clear[name]:.3g}"
             yield at_most(f"iso_distance_{name}", away[name], bound, "voxel", f"{words}, {which} ({aside})")
         elif clear:
             aside = f" ({metal})" if metal else ""

@@ -97,6 +97,7 @@ def decimate_mesh(
     rounds = decimation.collapse(wanted, tell_left)
     taken_back = decimation.mend()
     vertices, triangles, topology = decimation.finish()
+    tell_left(0)  # where the bound has ended it
     facts = {
         "fraction": fraction,
         "reached": 1.0 - len(triangles) / mesh.triangle_count,

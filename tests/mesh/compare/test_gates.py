@@ -162,8 +162,7 @@ def test_an_extracted_mesh_is_judged_by_its_vertices_and_a_refined_one_by_what_l
 NEAR_METAL = {
     "surface_voxel": {"p95": 0.3, "mean": 0.2},
     "not_found": 0,
-    "samples": {"vertices": 4000},
-    "near_metal": 1500,
+    "near_metal_share": 0.375,
     "away_from_metal_voxel": {"p95": 0.2, "mean": 0.11},
 }
 
@@ -172,15 +171,15 @@ def test_distances_away_from_metal_are_judged_and_those_with_it_are_said():
     _, p95, mean = judge_mesh(iso_distance=NEAR_METAL)
     assert (p95["measured"], p95["ok"]) == (0.2, True)
     assert (mean["measured"], mean["ok"]) == (0.11, False)
-    with_metal = "(without 1,500 of 4,000 vertices near metal (above 2000 HU), with them 0.3)"
+    with_metal = "(without 38 % of the surface near metal (above 2000 HU), with it 0.3)"
     assert p95["text"].endswith(f", 95 % of it {with_metal}: 0.2 voxel, at most 0.25")
 
 
 def test_a_mesh_mostly_near_metal_is_judged_whole_and_the_share_near_metal_is_said():
-    mostly = {**NEAR_METAL, "near_metal": 2500, "away_from_metal_voxel": None}
+    mostly = {**NEAR_METAL, "near_metal_share": 0.625, "away_from_metal_voxel": None}
     _, p95, mean = judge_mesh(iso_distance=mostly)
     assert (p95["measured"], p95["ok"], mean["ok"]) == (0.3, False, False)
-    assert "(2,500 of 4,000 vertices near metal (above 2000 HU))" in p95["text"]
+    assert "(62 % of the surface near metal (above 2000 HU))" in p95["text"]
 
 
 LABEL_ML = 63.0

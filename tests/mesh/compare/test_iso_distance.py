@@ -309,14 +309,12 @@ TWO_TRIANGLES = [[0, 1, 2], [3, 4, 5]]
 METAL_HU, DENSE_BONE_HU = 2001, 2000
 
 
-def test_vertices_within_two_voxels_of_metal_are_counted_and_left_out():
+def test_vertices_within_two_voxels_of_metal_are_left_out():
     volume = bone_beside_a_dense_voxel(METAL_HU)
     rule = choose_iso_rule(volume, 200, closed=False)
-    others = [JUST_BEYOND, BONE_EDGE, BONE_EDGE]
-    measured = measure_iso_distance(
-        Mesh(np.array([*WITHIN_TWO_VOXELS_OF_METAL, *others], float), TWO_TRIANGLES), volume, rule
-    )
-    assert measured["near_metal"] == 3
+    others = [JUST_BEYOND, (11, 2.9, 3), BONE_EDGE, (4.5, 0, 0), (4.5, 6, 0), (4.5, 0, 6)]
+    vertices = np.array([*WITHIN_TWO_VOXELS_OF_METAL, *others], float)
+    measured = measure_iso_distance(Mesh(vertices, [*TWO_TRIANGLES, [6, 7, 8]]), volume, rule)
     of_others = distances_to_iso_surface(volume, rule, np.array(others, float))
     assert np.isfinite(of_others).sum() >= 2
     assert measured["away_from_metal_voxel"]["max"] == np.nanmax(of_others)
@@ -330,14 +328,38 @@ def test_vertices_near_dense_bone_and_on_a_surface_of_metal_are_not_left_out(lev
     vertices = np.array([*WITHIN_TWO_VOXELS_OF_METAL, JUST_BEYOND, BONE_EDGE, BONE_EDGE], float)
     rule = choose_iso_rule(volume, iso_value, closed=False)
     measured = measure_iso_distance(Mesh(vertices, TWO_TRIANGLES), volume, rule)
-    assert (measured["near_metal"], measured["away_from_metal_voxel"]) == (0, None)
+    assert (measured["near_metal_share"], measured["away_from_metal_voxel"]) == (0.0, None)
 
 
-def test_a_mesh_with_most_vertices_near_metal_has_no_figures_away_from_it():
+SQUARE_NEAR_METAL = [(8, 3, 3), (9, 3, 3), (8, 4, 3)]  # 0.5 mm2
+
+
+@pytest.mark.parametrize(
+    ("edge_mm", "near_metal_share", "is_left_out"),
+    [(2, 0.2, True), (0.5, 0.8, False)],  # triangles of 2 and 0.125 mm2 beside that of 0.5 mm2
+    ids=["less than half of the area", "most of it"],
+)
+def test_what_is_near_metal_is_left_out_up_to_half_of_the_area(edge_mm, near_metal_share, is_left_out):
     volume = bone_beside_a_dense_voxel(METAL_HU)
-    vertices = np.array([(8, 3, 3)] * 4 + [BONE_EDGE] * 2, float)
-    measured = measure_iso_distance(Mesh(vertices, TWO_TRIANGLES), volume, choose_iso_rule(volume, 200, closed=False))
-    assert (measured["near_metal"], measured["away_from_metal_voxel"]) == (4, None)
+    far = np.array([(4, 1, 1), (4, 1 + edge_mm, 1), (4, 1, 1 + edge_mm)], float)
+    mesh = Mesh(np.concatenate([SQUARE_NEAR_METAL, far]), TWO_TRIANGLES)
+    measured = measure_iso_distance(mesh, volume, choose_iso_rule(volume, 200, closed=False))
+    assert measured["near_metal_share"] == pytest.approx(near_metal_share)
+    assert (measured["away_from_metal_voxel"] is not None) == is_left_out
+
+
+@pytest.mark.parametrize("at", ["vertices_mm", "centres_mm", "surface_mm"])
+def test_distances_are_of_the_area_and_not_of_the_number_of_points(at):
+    """One triangle of 2 mm2 at the level and four of 0.125 mm2 each at 0.4 mm from it: a fifth of the area."""
+    volume = volume_of(lambda points: 1000.0 * points[:, 2], np.eye(4))
+    large = np.array([(1, 1, 3), (3, 1, 3), (1, 3, 3)], float)
+    small = np.array([(5, 5, 3.4), (5.5, 5, 3.4), (5, 5.5, 3.4)], float)
+    vertices = np.concatenate([large, *[small] * 4])
+    mesh = Mesh(vertices, np.arange(len(vertices)).reshape(-1, 3))
+    measured = measure_iso_distance(mesh, volume, choose_iso_rule(volume, 3000.0, closed=False))
+    of_surface = measured["surface_voxel"] if at == "surface_mm" else measured[at]  # voxels of 1 mm
+    assert of_surface["mean"] == pytest.approx(0.2 * 0.4, rel=1e-3)  # the last step of a search is below 1e-3 mm
+    assert of_surface["p95"] == pytest.approx(0.4, rel=1e-3)
 
 
 BALL_RADIUS = 4.5
