@@ -322,9 +322,10 @@
   const channels = (color) => [1, 3, 5].map((at) => parseInt(color.slice(at, at + 2), 16) / 255);
 
   // Ml of what is enclosed, else how many points or triangles there are.
-  function saySize({ ml, count }) {
+  function saySize({ ml, count, kind }) {
     if (ml !== null || count === null) return sayMl(ml);
-    return count < 1e5 ? count.toLocaleString("en") : `${(count / 1e6).toFixed(2)} M`;
+    const number = count < 1e5 ? count.toLocaleString("en") : `${(count / 1e6).toFixed(2)} M`;
+    return `${number} ${{ mesh: "triangles", cloud: "points" }[kind] || ""}`;
   }
 
   function showParts() {
@@ -423,6 +424,7 @@
 
   function showAbout() {
     const lines = facts.objects.flatMap(({ name, said }) => [name, ...said]);
+    if (!facts.iso) find("title").textContent = facts.objects.map(({ name }) => name).join(" \u00b7 ");
     find("about").replaceChildren(...[...facts.notes, ...lines, ...facts.warnings.filter((text) => !lines.includes(text))]
       .map((text) => element("p", text)));
   }
