@@ -299,15 +299,14 @@ def odd(shared_folder: Path) -> Any:
     return OddBodies(shared_folder)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def downloads(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where `view_browser` saves what a page gives it."""
     return tmp_path_factory.mktemp("downloads")
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def view_browser(downloads: Path) -> Iterator[Any]:
-    """A browser for the pages of views, one after the other."""
     from browser import open_browser
 
     with open_browser(1200, 800) as driver:
