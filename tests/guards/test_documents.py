@@ -104,6 +104,20 @@ def test_file_that_is_linked_or_quoted_and_does_not_exist_is_found(text: str, mi
     assert find_missing_files(text, ROOT) == missing
 
 
+GLUED = re.compile(r": - \*\*|\| \|---|^(?![-|<#*]|\d+\. | )[^\n]+\n(?:- |\|)", re.MULTILINE)
+"""A list or a table that begins within the paragraph before it, which is then shown as part of that paragraph."""
+
+
+@pytest.mark.parametrize("name", DOCUMENTS)
+def test_list_or_table_of_a_document_begins_after_an_empty_line(name: str) -> None:
+    assert GLUED.findall(re.sub(r"^```.*?^```", "", read_document(name), flags=re.DOTALL | re.MULTILINE)) == []
+
+
+@pytest.mark.parametrize("text", ["Why: - **A.** B", "Air: | a | |---|\n", "Why:\n- a\n", "Air:\n| a |\n"])
+def test_list_or_table_glued_to_a_paragraph_is_found(text: str) -> None:
+    assert GLUED.findall(text)
+
+
 PAGES = sorted(path.relative_to(ROOT).as_posix() for path in (ROOT / "docs").glob("*.md"))
 
 
