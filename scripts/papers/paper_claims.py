@@ -87,7 +87,7 @@ def _accuracy(report: Report) -> str:
     golden = rows["i-mc-golden"]
     above = [name for name, recall in found.items() if recall >= ACCURACY_OF_PAPER]
     verdict = "Holds for " + ", ".join(rows[name]["title"] for name in above) + "." if above else "Does not hold here."
-    each = ", ".join(f"{recall:.1%} for {rows[name]['title']}" for name, recall in found.items())
+    each = ", ".join(f"{recall:.2%} for {rows[name]['title']}" for name, recall in found.items())
     return _claim(
         f"Accuracy above {ACCURACY_OF_PAPER:.1%}.",
         verdict,
