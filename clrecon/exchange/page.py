@@ -15,12 +15,10 @@ of x, y, z of the normals, and four of the indices.
 from __future__ import annotations
 
 import base64
-import gzip
 import hashlib
 import json
 import os
 import re
-import zlib
 from collections.abc import Sequence
 from functools import cache
 from importlib.resources import files
@@ -34,7 +32,8 @@ from clrecon.errors import UsageError
 from clrecon.exchange.content import BONE_COLOR, Assembly, Content, check_same, parts_of, refuse_file
 from clrecon.exchange.page_slices import PackedSlices, describe_slices
 from clrecon.system.light_dataclass import dataclass
-from clrecon.system.pieces import side_by_side
+from clrecon.system.packing import GZIP, find_deflate, start_packing
+from clrecon.system.pieces import find_bounds, side_by_side
 from clrecon.version import package_version
 
 STEPS = 65_535
@@ -42,7 +41,7 @@ STEPS = 65_535
 
 _NORMAL_SCALE = 127.0
 _LEVEL = 4
-"""Of deflate: 6 takes twice as long, for files 2.5 % smaller."""
+"""Of zlib: 6 takes twice as long, for files 2.5 % smaller."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,9 +66,9 @@ def encode_surface(
     """Code a surface of at least one triangle, whose order stays; normals (n, 3) are unit vectors."""
     order, corners = _renumber(triangles, len(vertices))
     places = vertices[order].astype(np.float64)
-    low, high = places.min(axis=0), places.max(axis=0)
+    low, high = find_bounds(places)
     step = (high - low) / STEPS
-    packer = zlib.compressobj(_LEVEL, wbits=16 + zlib.MAX_WBITS)  # 16: a file of gzip
+    packer = start_packing(_LEVEL, GZIP)
 
     def pack_vertices() -> bytes:
         scaled = (places - low) / np.where(step > 0.0, step, 1.0)
@@ -90,13 +89,8 @@ def encode_surface(
 
 def decode_surface(coded: CodedSurface) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.uint32]]:
     """Return vertices in mm, normals (not of unit length: as they were rounded) and triangles, as a page shows them."""
-    try:
-        data = np.frombuffer(gzip.decompress(coded.data), np.uint8)
-    except (OSError, EOFError, zlib.error) as error:
-        raise ValueError(f"the data of the surface cannot be unpacked: {error}") from error
-    n, corners = coded.vertices, 3 * coded.triangles
-    if len(data) != 9 * n + 4 * corners:
-        raise ValueError(f"the surface has {len(data):,} bytes, {9 * n + 4 * corners:,} expected")
+    data = _unpack_planes(coded)
+    n = coded.vertices
     positions = _unfold(_join_planes(data[: 6 * n], 3, np.uint16), np.uint16)
     turned = _unfold(_join_planes(data[6 * n : 9 * n], 3, np.uint8), np.uint8).view(np.int8)
     codes = _join_planes(data[9 * n :], 1, np.uint32)[:, 0].astype(np.int64)
@@ -108,6 +102,18 @@ def decode_surface(coded: CodedSurface) -> tuple[NDArray[np.float64], NDArray[np
     vertices = np.array(coded.low_mm) + positions.astype(np.float64) * np.array(coded.step_mm)
     normals = (turned / np.float32(_NORMAL_SCALE)).astype(np.float32)
     return vertices, normals, indices.reshape(-1, 3).astype(np.uint32)
+
+
+def _unpack_planes(coded: CodedSurface) -> NDArray[np.uint8]:
+    deflate = find_deflate()
+    try:
+        data = np.frombuffer(deflate.decompress(coded.data, GZIP), np.uint8)
+    except deflate.error as error:
+        raise ValueError(f"the data of the surface cannot be unpacked: {error}") from error
+    expected = 9 * coded.vertices + 12 * coded.triangles
+    if len(data) != expected:
+        raise ValueError(f"the surface has {len(data):,} bytes, {expected:,} expected")
+    return data
 
 
 def _renumber(triangles: NDArray[np.integer], count: int) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
@@ -231,10 +237,10 @@ def verify(path: Path, content: Content | Assembly) -> None:
     """Unpack a finished file, whose gzip has a checksum, and count what is in it."""
     try:
         _, coded = parse_page(path.read_bytes())
-        _, _, triangles = decode_surface(coded)
+        _unpack_planes(coded)
     except ValueError as error:
         raise refuse_file(f"({error})", "no page", "a page") from error
-    check_same("triangles", len(triangles), sum(len(part.triangles) for part in parts_of(content)))
+    check_same("triangles", coded.triangles, sum(len(part.triangles) for part in parts_of(content)))
 
 
 def _join_parts(meshes: Sequence[Content]) -> tuple[CodedSurface, list[dict[str, Any]]]:

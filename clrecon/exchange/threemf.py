@@ -27,6 +27,7 @@ from clrecon.errors import OutputError, RefusedInputError
 from clrecon.exchange.content import BONE_COLOR, Assembly, Content, check_same, parts_of, write_lines
 from clrecon.exchange.raw_content import MOST_LEVELS, Part, PlacedShapes, RawMesh, Shape, read_remarks, say_cut
 from clrecon.system.light_dataclass import dataclass, field
+from clrecon.system.packing import RAW, find_deflate, start_packing
 from clrecon.system.paths import open_regular
 from clrecon.system.text import escape_text
 
@@ -65,7 +66,10 @@ def _unpacked(content: Content) -> int:
 
 
 def write(stream: BinaryIO, content: Content | Assembly) -> None:
-    """Write the package.  Level 1 packs to 21 %, in 0.4 of the time in which level 6 packs to 17 %."""
+    """Write the package.  Level 1 of zlib packs to 19 %, ISA-L to 18 % in a third of the time.
+
+    `zipfile` has no parameter for the library that packs; if a Python names it otherwise, zlib packs.
+    """
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as package:
         for name, text in _SMALL_PARTS.items():
             with package.open(name, "w") as entry:
@@ -74,6 +78,7 @@ def write(stream: BinaryIO, content: Content | Assembly) -> None:
         # The 64-bit extension of ZIP is used only where it is needed, because some readers do not know it.
         large = sum(map(_unpacked, parts)) > zipfile.ZIP64_LIMIT
         with package.open(_MODEL, "w", force_zip64=large) as model:
+            model._compressor = start_packing(1, RAW)  # type: ignore[attr-defined]
             model.write(_opening(parts).encode("ascii"))
             for number, part in enumerate(parts):
                 model.write(_object(parts, number).encode("ascii"))
@@ -137,8 +142,10 @@ def verify(path: Path, content: Content | Assembly) -> None:
     """Unpack the finished file, which verifies its checksums, and count its elements."""
     vertices = triangles = 0
     tail = b""
+    deflate = find_deflate()
     try:
         with zipfile.ZipFile(path) as package, package.open(_MODEL) as model:
+            model._decompressor = deflate.decompressobj(RAW)  # type: ignore[attr-defined]
             while piece := model.read(_PIECE_OUT):
                 piece = tail + piece
                 # Only whole lines are counted; the rest is carried over to the next piece.
@@ -146,7 +153,7 @@ def verify(path: Path, content: Content | Assembly) -> None:
                 vertices += piece.count(b"<vertex ", 0, cut)
                 triangles += piece.count(b"<triangle ", 0, cut)
                 tail = piece[cut:]
-    except (zipfile.BadZipFile, KeyError) as error:
+    except (zipfile.BadZipFile, KeyError, EOFError, deflate.error) as error:
         raise OutputError(f"the file did not arrive on the disk as it was written: {error}") from error
     check_same("vertices", vertices, sum(len(part.vertices) for part in parts_of(content)))
     check_same("triangles", triangles, sum(len(part.triangles) for part in parts_of(content)))

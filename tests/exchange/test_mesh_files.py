@@ -7,6 +7,7 @@ import errno
 import io
 import json
 import struct
+import sys
 import zipfile
 
 import numpy as np
@@ -18,6 +19,7 @@ from refusals import refused
 from clrecon.errors import NoSurfaceError, OutputError, UsageError
 from clrecon.exchange import formats as writers
 from clrecon.exchange.formats import FORMATS
+from clrecon.exchange.page import decode_surface, parse_page
 from clrecon.mesh import Mesh
 
 pytestmark = pytest.mark.unit
@@ -416,6 +418,25 @@ class FullDisk(io.RawIOBase):
         if self.room < 0:
             raise OSError(errno.ENOSPC, "No space left on device")
         return len(data)
+
+
+@pytest.mark.parametrize("extension", [".3mf", ".html"])
+def test_mesh_packed_by_isal_is_unpacked_by_zlib_as_that_which_zlib_packed(mesh, extension, tmp_path, monkeypatch):
+    pytest.importorskip("isal")
+    files = [tmp_path / f"{library}{extension}" for library in ("isal", "zlib")]
+    mesh.save(files[0])
+    monkeypatch.setitem(sys.modules, "isal.isal_zlib", None)
+    mesh.save(files[1])
+    by_isal, by_zlib = (path.read_bytes() for path in files)
+    assert by_isal != by_zlib  # both were used
+    if extension == ".3mf":
+        by_isal, by_zlib = (zipfile.ZipFile(path).read("3D/3dmodel.model") for path in files)
+        assert by_isal == by_zlib
+    else:
+        for unpacked, expected in zip(
+            *(decode_surface(parse_page(page)[1]) for page in (by_isal, by_zlib)), strict=True
+        ):
+            np.testing.assert_array_equal(unpacked, expected)
 
 
 @pytest.mark.faults
