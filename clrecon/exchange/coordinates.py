@@ -9,9 +9,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
 from clrecon.geometry.vertices import float32_step, is_far
-from clrecon.system.pieces import find_bounds
+from clrecon.system.pieces import find_bounds, in_threads, sort_with_rows
 
 _MOST_STEPS_APART = 64
+
+_PIECE = 1 << 17
+"""Vertices that are searched at a time for those at one place, in the processor's cache."""
 
 
 def rows_of_three(
@@ -74,19 +77,36 @@ def find_coincident(vertices: NDArray[np.floating]) -> NDArray[np.int64]:
 
 
 def find_places(vertices: NDArray[np.floating]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the first vertex at each place, (p,), in the order of vertices, and the place of each vertex, (n,)."""
-    mixed = _scramble(vertices)
-    order = np.argsort(mixed)
-    mixed = mixed.take(order)
-    start = np.flatnonzero(np.append(True, mixed[1:] != mixed[:-1])[: len(mixed)])
-    first = np.minimum.reduceat(order, start) if len(start) else start
-    first_of_each = np.empty(len(vertices), np.int64)
-    first_of_each[order] = np.repeat(first, np.diff(start, append=len(vertices)))
-    if not np.array_equal(vertices.take(first_of_each, axis=0), vertices):  # two places with one sum, or NaN
+    """Return the first vertex at each place, (p,), in the order of vertices, and the place of each vertex, (n,).
+
+    Pieces are searched first, then what differs within each: corners at one place are mostly near to each other.
+    """
+    count = len(vertices)
+    first_of_each = np.empty(count, np.int64)
+
+    def search_piece(piece: slice) -> None:
+        first_of_each[piece] = _find_firsts(vertices[piece]) + piece.start
+
+    in_threads(search_piece, count, _PIECE)
+    is_first = first_of_each == np.arange(count)
+    first = np.flatnonzero(is_first)
+    of_first = _find_firsts(vertices[first])
+    is_kept = of_first == np.arange(len(first))
+    place_of_first = (np.cumsum(is_kept) - 1).take(of_first)
+    return first[is_kept], place_of_first.take((np.cumsum(is_first) - 1).take(first_of_each))
+
+
+def _find_firsts(vertices: NDArray[np.floating]) -> NDArray[np.int64]:
+    """Return the first vertex at the place of each, (n,)."""
+    count = len(vertices)
+    ordered, order = sort_with_rows(_scramble(vertices))
+    start = np.flatnonzero(np.append(True, ordered[1:] != ordered[:-1])[:count])
+    firsts = np.empty(count, np.int64)
+    firsts[order] = np.repeat(order[start], np.diff(start, append=count))
+    if not np.array_equal(vertices.take(firsts, axis=0), vertices):  # two places with one sum, or NaN
         _, first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
-        first_of_each = first[inverse.reshape(-1)]
-    is_first = first_of_each == np.arange(len(vertices))
-    return np.flatnonzero(is_first), (np.cumsum(is_first) - 1).take(first_of_each)
+        firsts = first[inverse.reshape(-1)]
+    return firsts
 
 
 def _scramble(vertices: NDArray[np.floating]) -> NDArray[np.uint64]:

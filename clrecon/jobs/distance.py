@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,8 +22,10 @@ from clrecon.mesh import Mesh
 from clrecon.mesh.compare.distances import SAMPLES, DistanceSummary
 from clrecon.mesh.compare.signed import Ruler, SideDistance, compare_sides
 from clrecon.mesh.mesh_reader import read_mesh
+from clrecon.mesh.quality import survey_surface
 from clrecon.system.arguments import Space
 from clrecon.system.light_dataclass import dataclass, replace
+from clrecon.system.pieces import side_by_side
 from clrecon.system.text import escape_text, format_digits
 
 if TYPE_CHECKING:
@@ -83,19 +86,22 @@ def measure_meshes(
         run.check(files.named("the coloured mesh"), mesh, reference)
         device = take_device(settings.device) if files.picture is not None or settings.surface is not None else None
         run.progress("read", 0, 0)
-        meshes = [read_side(mesh, settings.mesh_space)]
         if settings.surface is None or device is None:
-            meshes.append(read_side(reference, settings.mesh_space))
+            make_other = partial(read_side, reference, settings.mesh_space)
         else:
-            meshes.append(_make_side(run, reference, device))
-        qualities = [own.quality() for own in meshes]
-        entries = [describe_mesh(*each) for each in zip(meshes, (mesh, reference), qualities, strict=True)]
+            make_other = partial(_make_side, run, reference, device)
+        meshes = side_by_side(partial(read_side, mesh, settings.mesh_space), make_other)
+        surveys = side_by_side(*(partial(survey_surface, own.vertices, own.triangles) for own in meshes))
+        entries = [
+            describe_mesh(own, path, survey[0])
+            for own, path, survey in zip(meshes, (mesh, reference), surveys, strict=True)
+        ]
         for entry in entries:
             if not entry["area_mm2"]:
                 raise NoSurfaceError(f"{entry['name']} has no triangle with an area: there is nothing to measure")
         run.lap("read")
         names = (entries[0]["name"], entries[1]["name"])
-        rulers = [Ruler.of(meshes[side], names[side], qualities[side]) for side in (1, 0)]
+        rulers = side_by_side(*(partial(Ruler.of, meshes[side], names[side], surveys[side]) for side in (1, 0)))
         apart = compare_sides(meshes, rulers, settings.samples or SAMPLES, run.progress)
         colored = None
         if files.output is not None or files.picture is not None:

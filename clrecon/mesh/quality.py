@@ -64,6 +64,13 @@ class MeshQuality(Record):
 
 
 def measure_quality(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> MeshQuality:
+    return survey_surface(vertices, triangles)[0]
+
+
+def survey_surface(
+    vertices: NDArray[np.floating], triangles: NDArray[np.uint32]
+) -> tuple[MeshQuality, connectivity.IntArray | None]:
+    """Measure a surface; return also the half-edge opposite each, see `clrecon.mesh.connectivity`."""
     vertex_count, triangle_count = len(vertices), len(triangles)
     if triangle_count and int(triangles.max()) >= vertex_count:
         raise UsageError(f"a triangle refers to vertex {int(triangles.max())}, the mesh has {vertex_count} vertices")
@@ -79,7 +86,7 @@ def measure_quality(vertices: NDArray[np.floating], triangles: NDArray[np.uint32
     closed = triangle_count > 0 and edges.boundary == 0 and edges.nonmanifold == 0 and open_by_place == 0
     manifold = triangle_count > 0 and edges.nonmanifold == 0 and edges.oriented and split_vertices == 0 and loops == 0
     area, volume, zero_area, shortest = measure_triangles(vertices, triangles)
-    return MeshQuality(
+    quality = MeshQuality(
         vertices=vertex_count,
         triangles=triangle_count,
         closed=closed,
@@ -102,6 +109,7 @@ def measure_quality(vertices: NDArray[np.floating], triangles: NDArray[np.uint32
         outward=volume > 0.0,
         bounds_mm=[corner.tolist() for corner in find_bounds(vertices)] if vertex_count else None,
     )
+    return quality, opposite
 
 
 def _count_by_place(

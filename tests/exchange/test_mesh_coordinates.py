@@ -30,6 +30,14 @@ def test_vertices_at_one_place_get_one_number_whatever_the_sign_of_zero():
     assert place_of_vertex.tolist() == [0, 1, 0, 1, 2]
 
 
+def test_vertices_far_apart_in_a_list_get_the_number_of_their_first_place():
+    numbers = np.random.default_rng(1).integers(0, 50, (300_000, 3))  # 125,000 places, over three pieces
+    first_of_place, place_of_vertex = find_places(numbers.astype(np.float32))
+    _, first, inverse = np.unique(numbers @ (2500, 50, 1), return_index=True, return_inverse=True)
+    assert np.array_equal(first_of_place, np.sort(first))
+    assert np.array_equal(first_of_place[place_of_vertex], first[inverse])
+
+
 def test_places_with_one_hash_are_told_apart():
     vertices = np.array([[1, 2, 3], [0, 0, 0], [1, 2, 3], [-0.0, 0, 0], [3, 2, 1]])
     hash_of_1, hash_of_3 = _scramble(vertices[[0, 4], :1])

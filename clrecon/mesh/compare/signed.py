@@ -21,11 +21,11 @@ from clrecon.mesh.compare.distances import (
     sample_surface,
     summarise_distances,
 )
-from clrecon.mesh.connectivity import find_edges, opposite_half_edges
+from clrecon.mesh.connectivity import IntArray, find_edges, opposite_half_edges
 from clrecon.mesh.mesh import Mesh
-from clrecon.mesh.quality import MeshQuality
+from clrecon.mesh.quality import MeshQuality, survey_surface
 from clrecon.mesh.triangle_tree import TriangleTree
-from clrecon.mesh.triangles import cross_products, vertex_normals
+from clrecon.mesh.triangles import cross_product, vertex_normals
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.pieces import chunks, local_origin
@@ -45,12 +45,21 @@ class SignedDistance:
     triangles: Every edge in two triangles, which run along it in opposite directions; triangles with a corner twice,
         which are no surface, are left out.
     outward: False: the triangles face inward, and the sign is turned.
+    opposite: The half-edge opposite each where it is known: then no triangle has a corner twice.
     """
 
-    def __init__(self, vertices: NDArray[np.floating], triangles: NDArray[np.uint32], *, outward: bool = True):
-        a, b, c = triangles.T
-        triangles = triangles[(a != b) & (b != c) & (c != a)]  # one with a corner twice is no surface
-        opposite = opposite_half_edges(triangles, find_edges(triangles, len(vertices)))
+    def __init__(
+        self,
+        vertices: NDArray[np.floating],
+        triangles: NDArray[np.uint32],
+        *,
+        outward: bool = True,
+        opposite: IntArray | None = None,
+    ):
+        if opposite is None:
+            a, b, c = triangles.T
+            triangles = triangles[(a != b) & (b != c) & (c != a)]  # one with a corner twice is no surface
+            opposite = opposite_half_edges(triangles, find_edges(triangles, len(vertices)))
         if opposite is None:
             raise UsageError("distances have a sign where the surface is closed and its triangles agree on the outside")
         self._origin = local_origin(vertices)
@@ -58,11 +67,6 @@ class SignedDistance:
         self._triangles = triangles
         self._tree = TriangleTree(vertices - self._origin, triangles)
         self._sign = 1.0 if outward else -1.0
-        faces = np.zeros((len(triangles), 3))
-        for piece, _, cross in cross_products(vertices, triangles, np.zeros(3)):
-            length = np.sqrt(np.einsum("ij,ij->j", cross, cross))
-            faces[piece] = np.divide(cross, length, out=np.zeros_like(cross), where=length > 0.0).T
-        self._faces = faces
         self._opposite = opposite
         self._corners = vertex_normals(vertices, triangles).astype(np.float64)
 
@@ -74,6 +78,13 @@ class SignedDistance:
         distance = np.sqrt(np.einsum("ij,ij->i", away, away))
         side = np.einsum("ij,ij->i", away, self._normals_at(nearest, rows))
         return np.where(side < 0.0, -self._sign, self._sign) * distance + 0.0
+
+    def _normals_of(self, rows: IntArray) -> Points:
+        """Return the normals of triangles, (k, 3), of unit length or zero."""
+        a, b, c = (self._vertices[corner].T for corner in self._triangles[rows].T)
+        cross = cross_product(b - a, c - a)
+        length = np.sqrt(np.einsum("ij,ij->j", cross, cross))
+        return np.divide(cross, length, out=np.zeros_like(cross), where=length > 0.0).T
 
     def _normals_at(self, places: Points, rows: NDArray[np.int64]) -> Points:
         """Return pseudonormals at places on triangles, shape (k, 3)."""
@@ -91,11 +102,11 @@ class SignedDistance:
         absent = shares <= _AT_CORNER
         absent[square == 0.0] = True  # a triangle without area: the nearest of its corners
         count = absent.sum(axis=1)
-        normals = self._faces[rows]
+        normals = self._normals_of(rows)
         on_edge = np.flatnonzero(count == 1)
         # Half-edge i runs from corner i to the next one: the corner that is absent is the one before.
         half = (absent[on_edge].argmax(axis=1) + 1) % 3
-        normals[on_edge] += self._faces[self._opposite[3 * rows[on_edge] + half] // 3]
+        normals[on_edge] += self._normals_of(self._opposite[3 * rows[on_edge] + half] // 3)
         at_corner = np.flatnonzero(count >= 2)
         corner = self._triangles[rows[at_corner], near[at_corner].argmin(axis=1)]
         normals[at_corner] = self._corners[corner]
@@ -111,17 +122,17 @@ class Ruler:
     warnings: list[str]
 
     @classmethod
-    def of(cls, mesh: Mesh, name: str, quality: MeshQuality | None = None) -> Ruler:
-        """Make the ruler of a mesh that warnings call `name`; its `quality` is measured where it is not known."""
+    def of(cls, mesh: Mesh, name: str, survey: tuple[MeshQuality, IntArray | None] | None = None) -> Ruler:
+        """Make the ruler of a mesh that warnings call `name`; `survey`: that of `survey_surface`, if it is known."""
         mesh.check()
         if not mesh.triangle_count:
             raise NoSurfaceError(f"{name} has no triangles: there is nothing to measure from")
-        quality = quality or mesh.quality()
+        quality, opposite = survey or survey_surface(mesh.vertices, mesh.triangles)
         why = why_unsigned(quality, name)
         if why is not None:
             return cls(SurfaceDistance(mesh.vertices, mesh.triangles), False, [why])
         inverted = f"{name} is turned inside out: the sign of distances from it is turned back"
-        signed = SignedDistance(mesh.vertices, mesh.triangles, outward=quality.outward)
+        signed = SignedDistance(mesh.vertices, mesh.triangles, outward=quality.outward, opposite=opposite)
         return cls(signed, True, [] if quality.outward else [inverted])
 
     def measure(
