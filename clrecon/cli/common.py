@@ -17,6 +17,7 @@ from clrecon.errors import ClreconError, OutputError, UsageError
 from clrecon.jobs.options import DeviceSettings, InputSettings, ScanSettings
 from clrecon.system.arguments import OptionSpeaker
 from clrecon.system.options import option_beside, options_of
+from clrecon.system.processes import has_hung_device
 from clrecon.system.progress import DEFAULT_SECONDS, check_time_limit
 from clrecon.system.text import guess_word
 
@@ -396,12 +397,6 @@ def guard(action: Callable[[], int], console: Console, debug: bool) -> int:
 
 _unfreed: list[BaseException] = []
 """Errors of a device that hangs: their frames hold buffers, and a driver may wait for the kernel to free one."""
-
-
-def has_hung_device() -> bool:
-    """True where a kernel still runs that nobody waits for any more; without a device nothing is imported for it."""
-    opencl = sys.modules.get("clrecon.opencl")
-    return opencl is not None and bool(opencl.has_hung_commands())
 
 
 def _report_error(error: BaseException, console: Console, debug: bool) -> int:

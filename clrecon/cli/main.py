@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import gc
-import os
 import signal
 import sys
-import threading
 from collections.abc import Sequence
 from functools import partial
 from importlib import import_module
@@ -16,12 +13,13 @@ from types import FrameType
 from typing import NamedTuple
 
 from clrecon.cli import common
-from clrecon.cli.common import EXIT_CODES, Parser, guard, has_hung_device, speaker_of
+from clrecon.cli.common import EXIT_CODES, Parser, guard, speaker_of
 from clrecon.cli.console import Console, filled_streams
 from clrecon.errors import UsageError
 from clrecon.system.arguments import in_python, spoken_by
 from clrecon.system.foreign_words import own_streams
 from clrecon.system.packages import hide_unused
+from clrecon.system.processes import end_process
 from clrecon.system.progress import DEFAULT_SECONDS, time_limit
 
 
@@ -58,9 +56,6 @@ _COLLECTED_AFTER = 50_000
 """Objects after which unused ones are looked for, 700 by default: imports make many and leave none unused, and looking
 takes 5 % of the processor time of a mesh."""
 
-_MOST_SECONDS_TO_END = 1.0
-"""Time for the removal of temporary folders after a kernel has hung."""
-
 _DESCRIPTION = "Surfaces in patient millimetres from CT series, computed on any OpenCL device."
 
 _EPILOG = f"""\
@@ -93,15 +88,7 @@ def run() -> None:
         # The stream is None (never opened) or its reader closed it; `main` has already printed everything.
         with contextlib.suppress(OSError, ValueError, AttributeError):
             stream.flush()
-    if has_hung_device():  # a driver may wait for the kernel when something is freed
-        ending = threading.Thread(target=atexit._run_exitfuncs, daemon=True)
-        ending.start()
-        ending.join(_MOST_SECONDS_TO_END)
-    else:
-        atexit._run_exitfuncs()
-    # Every file is closed by now.  The interpreter would free modules, drivers and voxels one by one, which takes as
-    # long as extracting the surface; the system frees all at once.
-    os._exit(code)
+    end_process(code)
 
 
 def _dispatch(arguments: list[str], console: Console) -> int:

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Mapping, Sequence
+from typing import NoReturn
 
 from clrecon.errors import DeviceError
+
+_MOST_SECONDS_TO_END = 1.0
+"""Time for the removal of temporary folders after a kernel has hung."""
 
 
 def list_cores() -> list[int]:
@@ -60,3 +66,24 @@ def describe_end(code: int) -> str:
     name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
     more = ": out of memory, or ended by somebody" if name == "SIGKILL" else ""
     return f"its process crashed with {name}{more}"
+
+
+def has_hung_device() -> bool:
+    """True where a kernel still runs that nobody waits for any more; without a device nothing is imported for it."""
+    opencl = sys.modules.get("clrecon.opencl")
+    return opencl is not None and bool(opencl.has_hung_commands())
+
+
+def end_process(code: int = 0) -> NoReturn:
+    """Run what is registered for the end of this process, such as the record of built kernels, and end it at once.
+
+    The interpreter would free modules, drivers and voxels one by one, which takes as long as extracting a surface; the
+    system frees all at once.  Every file is closed by now.
+    """
+    if has_hung_device():  # a driver may wait for the kernel when something is freed
+        ending = threading.Thread(target=atexit._run_exitfuncs, daemon=True)
+        ending.start()
+        ending.join(_MOST_SECONDS_TO_END)
+    else:
+        atexit._run_exitfuncs()
+    os._exit(code)

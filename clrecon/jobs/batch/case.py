@@ -23,6 +23,7 @@ from clrecon.system.files import hold_interrupts, temporary_folder
 from clrecon.system.light_dataclass import dataclass, fields
 from clrecon.system.packages import hide_unused
 from clrecon.system.paths import final_mode, place_folder, system_errors
+from clrecon.system.processes import end_process
 from clrecon.system.progress import time_limit
 
 DONE, GATE = "done", "gate"
@@ -272,7 +273,7 @@ def run_worker() -> NoReturn:
                 answers.flush()
     except (KeyboardInterrupt, BrokenPipeError):
         pass
-    os._exit(0)  # the driver of a device that hangs would wait
+    end_process()
 
 
 def _open_device(plan: Plan) -> DeviceError | None:

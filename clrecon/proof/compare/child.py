@@ -16,6 +16,7 @@ from clrecon.operators import choose_device
 from clrecon.proof.compare.makers import Scene, draw, make_timed, time_small
 from clrecon.proof.compare.methods import COMPARED
 from clrecon.proof.compare.processes import Request, load_volume, save_arrays, save_mesh
+from clrecon.system.processes import end_process
 from clrecon.system.progress import time_limit
 
 LONG_SECONDS = 2.0
@@ -122,7 +123,7 @@ def main() -> None:
     request = Request(**{**data, "size": tuple(data["size"])})
     lines.write(to_json(run_method(request), indent=None) + "\n")
     lines.flush()
-    os._exit(0)  # the driver of a device that hangs would wait
+    end_process()
 
 
 if __name__ == "__main__":

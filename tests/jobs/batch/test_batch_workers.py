@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from batch_processes import children_of, wait_until
 
+from clrecon.opencl.pocl import KnownGood
 from clrecon.proof.phantom import PhantomSettings, write_phantom
 
 pytestmark = [
@@ -103,6 +104,23 @@ def test_interrupted_batch_ends_with_130_and_leaves_only_whole_cases(tmp_path: P
     left = sorted((tmp_path / "out").iterdir(), key=lambda folder: small_cases.index(folder.name))
     assert [folder.name for folder in left] == small_cases[: len(left)] and len(left) < len(small_cases)
     assert all((folder / "mesh.stl").is_file() and (folder / "case.json").is_file() for folder in left)
+
+
+def test_kernels_that_a_worker_has_built_are_on_record_when_it_has_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kernels = tmp_path / "clrecon"
+    monkeypatch.setenv("POCL_CACHE_DIR", str(kernels))
+    write_ball(tmp_path / "small", 24)
+    write_manifest(tmp_path, {"only": "small"})
+    process = start(tmp_path, "--no-measure")
+    _, errors = process.communicate(timeout=240)
+    assert process.returncode == 0, errors
+    if not list(kernels.glob("??/*")):
+        pytest.skip("this driver keeps no programs, or keeps them elsewhere")
+    next_process = KnownGood(kernels)
+    next_process.sweep()
+    assert next_process.warnings == []
 
 
 def test_batch_on_a_full_disk_ends_with_6_and_resumes_when_there_is_room(tmp_path: Path) -> None:
