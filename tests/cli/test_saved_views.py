@@ -63,21 +63,11 @@ def saved(device: Any, scan: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 @pytest.mark.opencl
+@pytest.mark.parametrize(("command", "option"), [("view", "--picture"), ("render", "-o")])
 def test_picture_of_a_saved_view_is_the_one_that_the_view_saved(
-    device: Any, scan: Path, saved: Path, tmp_path: Path
+    command: str, option: str, device: Any, scan: Path, saved: Path, tmp_path: Path
 ) -> None:
-    arguments = ["view", str(scan), "--state", str(saved / "shown.view.json"), "--picture", str(tmp_path / "again.png")]
-
-    assert main([*arguments, "--size", "160x120", "--device", str(device.index)]) == 0
-
-    assert (tmp_path / "again.png").read_bytes() == (saved / "shown.png").read_bytes()
-
-
-@pytest.mark.opencl
-def test_render_with_a_saved_view_draws_the_picture_that_the_view_saved(
-    device: Any, scan: Path, saved: Path, tmp_path: Path
-) -> None:
-    arguments = ["render", str(scan), "--state", str(saved / "shown.view.json"), "-o", str(tmp_path / "again.png")]
+    arguments = [command, str(scan), "--state", str(saved / "shown.view.json"), option, str(tmp_path / "again.png")]
 
     assert main([*arguments, "--size", "160x120", "--device", str(device.index)]) == 0
 

@@ -5,12 +5,12 @@ them.
 from __future__ import annotations
 
 import errno
-import io
 import sys
 
 import numpy as np
 import pytest
 import tolerances
+from full_disk import FullDisk
 from refusals import refused
 
 from clrecon.errors import NoSurfaceError, OutputError, RefusedInputError, UsageError
@@ -407,22 +407,6 @@ def test_cloud_is_not_saved_over_a_file_with_no_clobber(tmp_path):
     with pytest.raises(OutputError):
         make_cloud(3).save(tmp_path / "bone.ply", no_clobber=True)
     assert (tmp_path / "bone.ply").read_bytes() == b"older"
-
-
-class FullDisk(io.RawIOBase):
-    """Takes some bytes and then says what a full disk says."""
-
-    def __init__(self, room: int):
-        self.room = room
-
-    def writable(self):
-        return True
-
-    def write(self, data):
-        self.room -= memoryview(data).nbytes
-        if self.room < 0:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        return memoryview(data).nbytes
 
 
 @pytest.mark.faults

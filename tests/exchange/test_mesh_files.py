@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import sample_meshes as samples
 import tolerances
+from full_disk import FullDisk
 from refusals import refused
 
 from clrecon.errors import NoSurfaceError, OutputError, UsageError
@@ -402,22 +403,6 @@ def test_mesh_with_an_index_beyond_its_vertices_is_refused_and_nothing_is_writte
     with refused(UsageError, 9, "vertex"):
         Mesh(np.eye(3), [[0, 1, 9]]).save(tmp_path / "bone.vtp")
     assert list(tmp_path.iterdir()) == []
-
-
-class FullDisk(io.RawIOBase):
-    """Takes some bytes and then says what a full disk says."""
-
-    def __init__(self, room: int):
-        self.room = room
-
-    def writable(self):
-        return True
-
-    def write(self, data):
-        self.room -= len(data)
-        if self.room < 0:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        return len(data)
 
 
 @pytest.mark.parametrize("extension", [".3mf", ".html"])

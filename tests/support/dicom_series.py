@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import hashlib
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -201,6 +202,18 @@ def set_raw(keyword: str, text: str, only: int | None = None) -> Change:
 
 def is_implicit(ds: Dataset) -> bool:
     return ds.file_meta.TransferSyntaxUID == ImplicitVRLittleEndian
+
+
+def hash_of(series: int) -> str:
+    """The hash by which the series of a `Plan` is told."""
+    return hashlib.sha256(f"{ROOT}.{series}".encode()).hexdigest()[:16]
+
+
+def write_two_series(folder: Path) -> Path:
+    """Series 2 of 7 slices and series 5 of 4, in files that do not tell."""
+    write_series(folder, Plan(series=5, shape=(4, 5, 6), name="a{}".format))
+    write_series(folder, Plan(series=2, name="sub/b{}".format))
+    return folder
 
 
 def set_values(only: int | None = None, **values: Any) -> Change:

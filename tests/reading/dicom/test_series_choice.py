@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import shutil
@@ -12,7 +11,17 @@ import numpy as np
 import pydicom
 import pytest
 import tolerances
-from dicom_series import ROOT, Plan, make_dataset, save_dataset, set_raw, set_values, write_series
+from dicom_series import (
+    ROOT,
+    Plan,
+    hash_of,
+    make_dataset,
+    save_dataset,
+    set_raw,
+    set_values,
+    write_series,
+    write_two_series,
+)
 from pydicom.data import get_testdata_file
 from pydicom.uid import MRImageStorage, SecondaryCaptureImageStorage
 from refusals import refused
@@ -27,16 +36,9 @@ CONTRACT = (
 ).split()
 
 
-def hash_of(series: int) -> str:
-    return hashlib.sha256(f"{ROOT}.{series}".encode()).hexdigest()[:16]
-
-
 @pytest.fixture
 def two_series(tmp_path):
-    """Series 2 of 7 slices and series 5 of 4, in files that do not tell."""
-    write_series(tmp_path, Plan(series=5, shape=(4, 5, 6), name="a{}".format))
-    write_series(tmp_path, Plan(series=2, name="sub/b{}".format))
-    return tmp_path
+    return write_two_series(tmp_path)
 
 
 def test_listing_has_the_names_of_the_contract(two_series):

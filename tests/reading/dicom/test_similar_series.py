@@ -2,26 +2,17 @@
 
 from __future__ import annotations
 
-import hashlib
-
 import pytest
-from dicom_series import ROOT, Plan, set_values, write_series
+from dicom_series import ROOT, Plan, hash_of, set_values, write_series, write_two_series
 from refusals import refused
 
 from clrecon.errors import RefusedInputError
 from clrecon.reading import list_series, read_volume
 
 
-def hash_of(series: int) -> str:
-    return hashlib.sha256(f"{ROOT}.{series}".encode()).hexdigest()[:16]
-
-
 @pytest.fixture
 def two_series(tmp_path):
-    """Series 2 of 7 slices and series 5 of 4."""
-    write_series(tmp_path, Plan(series=5, shape=(4, 5, 6), name="a{}".format))
-    write_series(tmp_path, Plan(series=2, name="sub/b{}".format))
-    return tmp_path
+    return write_two_series(tmp_path)
 
 
 def test_series_are_numbered_by_patient_and_study_with_unknown_patients_last(tmp_path):
