@@ -93,10 +93,8 @@ def remove_outliers(
     ------
     UsageError
         The cloud is empty, ``k`` is out of range, or ``deviations`` is negative or no number.
-    DeviceMemoryError
-        The device has no room for the cloud.
     DeviceError
-        The device fails.
+        The device has no room for the cloud, or it fails.
     """
     ocl.check_memory(memory)
     points = take_points(cloud)
@@ -199,10 +197,8 @@ def denoise_points(
     ------
     UsageError
         The cloud is empty, or a parameter is out of range.
-    DeviceMemoryError
-        The device has no room for the cloud.
     DeviceError
-        The device fails.
+        The device has no room for the cloud, or it fails.
     """
     ocl.check_memory(memory)
     points = take_points(cloud)

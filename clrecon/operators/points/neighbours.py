@@ -318,10 +318,8 @@ def find_neighbours(
     UsageError
         The cloud is empty or has coordinates that are not finite, ``k`` is out of range, or more than 1e12 pairs of
         points of single cells would have to be compared.
-    DeviceMemoryError
-        The device has no room for the cloud and 8 k bytes a point.
     DeviceError
-        The device fails.
+        The device has no room for the cloud and 8 k bytes a point, or it fails.
 
     Examples
     --------

@@ -177,10 +177,8 @@ def estimate_normals(
     ------
     UsageError
         The cloud is empty, ``k`` is out of range, or volume and viewpoint are given both.
-    DeviceMemoryError
-        The device has no room for the cloud.
     DeviceError
-        The device fails.
+        The device has no room for the cloud, or it fails.
     """
     ocl.check_memory(memory)
     points = take_points(cloud)
