@@ -215,10 +215,10 @@ __kernel void select_edges(
  *             counts    in and out   edges that are chosen, entries of `neighbours`, collapses
  *             first_places, first_corners, begin, around, frames, stars   in   the given surface, as for `find_near_faces`
  *             chosen    in   edges, of `select_edges`
- *             round
+ *             number    of the round
  *             limit     mm2: no point may lie farther away
  *             most      mm2: as for `rank_edges`
- *             step      mm: points of new edges are no farther apart
+ *             spacing   mm: points of new edges are no farther apart
  * Launch      global = counts[0] or more, rounded up by the host, local at most GROUP
  * Assumes     as above
  * Guarantees  the surface stays closed, and its volume but for rounding */
@@ -231,7 +231,7 @@ __kernel void collapse_edges(
     __global uint *restrict counts, __global const float *restrict first_places,
     __global const uint *restrict first_corners, __global const int *restrict begin, __global const int *restrict around,
     __global const float4 *restrict frames, __global const float8 *restrict stars, __global const uint *restrict chosen,
-    const uint count, const uint round, const float limit, const float most, const float step)
+    const uint count, const uint number, const float limit, const float most, const float spacing)
 {
     __local float rings[3 * GROUP * (MOST_RING + 1)];
     __local uint vertices[GROUP * MOST_RING], fans[GROUP * MOST_RING], nears[GROUP * MOST_RING];
@@ -269,7 +269,7 @@ __kernel void collapse_edges(
             &surface, own.place + own.origin, limit, EASY_GIVEN * limit, &home, &near_face);
         passes = square < limit
             && land_points(&own, points, heads, edge / 3u, back / 3u, count, limit)
-            && fan_lies_near(&own, &surface, homes, home, limit, step, square);
+            && fan_lies_near(&own, &surface, homes, home, limit, spacing, square);
     }
     if (!passes) {
         octaves[edge] = REFUSED;
@@ -302,7 +302,7 @@ __kernel void collapse_edges(
     const uint entry = atomic_add(&counts[1], own.size);
     for (uint i = 0; i < own.size; ++i)
         neighbours[entry + i] = own.vertices[i];
-    vstore4((uint4)(u, round, entry, own.size), w, into);
+    vstore4((uint4)(u, number, entry, own.size), w, into);
     const float3 place = own.place + own.origin;
     places[u] = (float4)(place, 0.0f);
     homes[u] = home;

@@ -147,7 +147,7 @@ class DeviceCollapser:
         self._launch(
             "collapse_edges", items, **self._surface, leaving=self._leaving, **self._ranks, dirty=self._dirty,
             **self._lists, **self._log, counts=counts, **self._target, chosen=chosen, count=self._count,
-            round=number, limit=self._limit, most=self._limit, step=_STEP * self._given.mean_edge,
+            number=number, limit=self._limit, most=self._limit, spacing=_STEP * self._given.mean_edge,
         )  # fmt: skip
         selected, *self._done = (int(count) for count in self._read(counts, np.uint32, 3))
         return selected, self._done[1]
