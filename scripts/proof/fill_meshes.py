@@ -59,6 +59,9 @@ def main() -> int:
     parser.add_argument("kinds", metavar="KIND", nargs="*", default=list(KINDS), help="phantoms (default: all five)")
     parser.add_argument("--peers-python", default=sys.executable, metavar="PYTHON", help="has tetgen and gmsh")
     options = parser.parse_args()
+    unknown = set(options.kinds) - set(KINDS)
+    if unknown:
+        parser.error(f"no phantom {', '.join(sorted(unknown))}: use {', '.join(KINDS)}")
     failed = 0
     print("| phantom | triangles before | after | TetGen | gmsh |\n|---|---|---|---|---|", flush=True)
     for kind in options.kinds:
