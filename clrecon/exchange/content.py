@@ -216,21 +216,76 @@ def write_lines(stream: IO[bytes], form: str, rows: NDArray[Any]) -> None:
 
 
 def _format_numbers(form: str, rows: NDArray[Any]) -> bytes:
+    if rows.dtype == np.float32 and form.count("%") == form.count(_SINGLE) and _have_nine_digits(rows):
+        return _format_singles(form, rows)
     # One % for many lines takes two thirds of the time of one % for each line.
     return (form * len(rows) % tuple(rows.ravel().tolist())).encode("ascii")
+
+
+_SINGLE = "%.9g"
+_TENS = 10.0 ** np.arange(-3, 8)
+"""Sizes of numbers from which on one decimal fewer is written: twelve below the first, one from the last on."""
+
+_POWERS = 10.0 ** np.arange(13)
+
+
+def _have_nine_digits(rows: NDArray[np.float32]) -> bool:
+    """Tell whether float64 holds the nine digits of all numbers exactly, and ``%.9g`` writes none with an exponent."""
+    sizes = np.abs(rows)
+    return bool(((sizes < 1e8) & ((sizes >= 1e-4) | (sizes == 0.0))).all())
+
+
+def _format_singles(form: str, rows: NDArray[np.float32]) -> bytes:
+    """Do what `_format_numbers` does in three fifths of the time, as `_format_whole_numbers` does."""
+    numbers = np.abs(rows.reshape(len(rows), -1).T.astype(np.float64))
+    decimals = 12 - np.searchsorted(_TENS, numbers.ravel(), side="right").reshape(numbers.shape)
+    scale = _POWERS[decimals]
+    scaled = np.rint(numbers * scale)  # exact before it is rounded: 24 bits and those of a power of five up to 12
+    whole = np.floor(scaled / scale)
+    decimal_digits = (scaled - whole * scale) * _POWERS[12 - decimals]
+    high = np.floor(decimal_digits / 1e6)
+    low = (decimal_digits - 1e6 * high).astype(np.int32)
+    high = high.astype(np.int32)
+    width = len(str(int(whole.max())))
+    canvas, columns = _start_canvas(form, _SINGLE, len(rows), 1 + width + 1 + 12)  # sign, digits, point, decimals
+    for column, number in enumerate(columns):
+        canvas[:, number] = np.where(np.signbit(rows[:, column]), ord("-"), 0)
+        _put_digits(canvas, number + 1, width, whole[column].astype(np.int32))
+        is_shown = np.zeros(len(rows), dtype=bool)  # no zeros at the end
+        for part, first in ((low[column], 8), (high[column], 2)):
+            for digit in range(5, -1, -1):
+                rest = part // 10
+                value = part - 10 * rest
+                part = rest
+                is_shown |= value > 0
+                canvas[:, number + width + first + digit] = np.where(is_shown, value + ord("0"), 0)
+        canvas[:, number + width + 1] = np.where(is_shown, ord("."), 0)
+    return canvas.tobytes().translate(None, b"\0")
+
+
+def _start_canvas(form: str, place: str, lines: int, width: int) -> tuple[NDArray[np.uint8], list[int]]:
+    """Return the bytes of lines, with NUL for numbers, and the column at which each number begins."""
+    texts = form.encode("ascii").split(place.encode("ascii"))
+    canvas = np.tile(np.frombuffer(bytes(width).join(texts), dtype=np.uint8), (lines, 1))
+    ends = np.cumsum([len(text) + width for text in texts[:-1]])
+    return canvas, (ends - width).tolist()
+
+
+def _put_digits(canvas: NDArray[np.uint8], column: int, digits: int, number: NDArray[Any]) -> None:
+    """Write whole numbers from a column on, all digits of a place at once, without zeros before them."""
+    for digit in range(digits - 1, -1, -1):
+        rest = number // 10
+        canvas[:, column + digit] = np.where((number > 0) | (digit == digits - 1), number - 10 * rest + ord("0"), 0)
+        number = rest
 
 
 def _format_whole_numbers(form: str, rows: NDArray[Any]) -> bytes:
     """Do what `_format_numbers` does in half of the time: all digits of a place at once, NUL where there is none."""
     numbers = rows.reshape(len(rows), -1).T
     digits = len(str(int(numbers.max())))
-    texts = form.encode("ascii").split(b"%d")
-    canvas = np.tile(np.frombuffer(bytes(digits).join(texts), dtype=np.uint8), (len(rows), 1))
-    columns = np.cumsum([len(text) + digits for text in texts]) - digits
-    for column, rest in zip(columns, numbers, strict=False):
-        for digit in range(digits - 1, -1, -1):
-            number, rest = rest, rest // 10
-            canvas[:, column + digit] = np.where((number > 0) | (digit == digits - 1), number - 10 * rest + ord("0"), 0)
+    canvas, columns = _start_canvas(form, "%d", len(rows), digits)
+    for column, number in zip(columns, numbers, strict=True):
+        _put_digits(canvas, column, digits, number)
     text = canvas.tobytes()
     return text.translate(None, b"\0") if b"\0" in text else text
 

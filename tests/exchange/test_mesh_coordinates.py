@@ -52,6 +52,20 @@ def test_places_with_one_hash_are_told_apart():
     assert place_of_vertex.tolist() == [0, 1, 0, 1, 2]
 
 
+@pytest.mark.parametrize("form", ["v %.9g %.9g %.9g\n", "%.9g,%.9g,%.9g;"], ids=["vertices of OBJ", "commas"])
+@pytest.mark.parametrize("size", [1e-30, 1e-4, 1e-3, 0.1, 1.0, 250.0, 1e5, 1e7, 1e8, 1e30])
+def test_numbers_of_single_precision_are_written_as_python_formats_them(form, size):
+    spread = np.random.default_rng(4).uniform(-10.0, 10.0, (2000, 3)) * size
+    eighths = np.round(8.0 * spread) / 8.0  # end in zeros or halves of the last digit
+    whole = np.round(spread)
+    beside = np.nextafter(np.full((4, 3), size, np.float32), np.float32([-1e38, 0.0, 1e38]))
+    rows = np.concatenate([spread, eighths, whole, beside]).astype(np.float32)
+    for part in (rows, rows[:0], np.float32([[np.nan, np.inf, -0.0]])):
+        written = io.BytesIO()
+        write_lines(written, form, part)
+        assert written.getvalue().decode("ascii") == "".join(form % tuple(row) for row in part.tolist())
+
+
 @pytest.mark.parametrize("form", ["f %d %d %d\n", "%d,%d,%d;"], ids=["faces of OBJ", "commas"])
 @pytest.mark.parametrize("above", [1, 10, 12_345, 4_294_967_296])
 def test_whole_numbers_are_written_as_python_formats_them(form, above):
