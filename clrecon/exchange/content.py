@@ -263,9 +263,9 @@ def _format_singles(form: str, rows: NDArray[np.float32]) -> bytes:
     return canvas.tobytes().translate(None, b"\0")
 
 
-def _start_canvas(form: str, place: str, lines: int, width: int) -> tuple[NDArray[np.uint8], list[int]]:
+def _start_canvas(form: str, code: str, lines: int, width: int) -> tuple[NDArray[np.uint8], list[int]]:
     """Return the bytes of lines, with NUL for numbers, and the column at which each number begins."""
-    texts = form.encode("ascii").split(place.encode("ascii"))
+    texts = form.encode("ascii").split(code.encode("ascii"))
     canvas = np.tile(np.frombuffer(bytes(width).join(texts), dtype=np.uint8), (lines, 1))
     ends = np.cumsum([len(text) + width for text in texts[:-1]])
     return canvas, (ends - width).tolist()
