@@ -86,11 +86,12 @@ def measure_meshes(
         run.check(files.named("the coloured mesh"), mesh, reference)
         device = take_device(settings.device) if files.picture is not None or settings.surface is not None else None
         run.progress("read", 0, 0)
+        read_own = partial(read_side, mesh, settings.mesh_space)
         if settings.surface is None or device is None:
-            make_other = partial(read_side, reference, settings.mesh_space)
+            # That which this thread raises is told: of two harmed files the first.
+            meshes = side_by_side(partial(read_side, reference, settings.mesh_space), read_own)[::-1]
         else:
-            make_other = partial(_make_side, run, reference, device)
-        meshes = side_by_side(partial(read_side, mesh, settings.mesh_space), make_other)
+            meshes = side_by_side(read_own, partial(_make_side, run, reference, device))
         surveys = side_by_side(*(partial(survey_surface, own.vertices, own.triangles) for own in meshes))
         entries = [
             describe_mesh(own, path, survey[0])

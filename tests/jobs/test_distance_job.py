@@ -246,6 +246,10 @@ def test_wrong_usage_of_distance_is_refused_in_one_line_and_writes_nothing(
     check_refused(["distance", files["a.stl"], *given], code, fact, tmp_path, printed)
 
 
+def test_of_two_missing_meshes_the_first_is_named(tmp_path: Path, printed: Printer) -> None:
+    check_refused(["distance", "first.stl", "second.stl"], 3, "first.stl", tmp_path, printed)
+
+
 def test_mesh_whose_triangles_have_no_area_is_refused(files: dict[str, str], tmp_path: Path, printed: Printer) -> None:
     vertices, triangles = box()
     flat = tmp_path / "flat.stl"
