@@ -10,10 +10,12 @@
  *
  * Reference: Treece et al. 2010, "High resolution cortical bone thickness measurement from clinical CT data", Med. Image
  * Anal. 14, 276-290; Golub and Pereyra 1973 (variable projection, with the Jacobian of Kaufman 1975); Abramowitz and
- * Stegun 1964, 26.2.17 (Phi).
+ * Stegun 1964, 26.2.17 (Phi); Keys 1981 (cubic convolution).
  *
  * Passes
- *   1. sample_profiles   once for each part of the volume that the device holds
+ *   1. sample_profiles   once for each part of the volume that the device holds;
+ *                        with CUBIC values between slices are those of a cubic convolution of four of them, where their
+ *                        gaps are alike within 1 %, else linear
  *   2. fit_profiles      all places of a piece; HU count in thousands inside, so that float32 keeps its digits */
 #include "include/lanes.h"
 #include "include/volume.h"
@@ -23,7 +25,17 @@
 #define RESULTS 9 /* numbers of a fit: x0, t, outer, cortex, inner, residual, variance of x0, peak, room */
 #define ROUNDS 6 /* steps of Levenberg and Marquardt */
 #define SLACK 1.0003f /* a step that costs so little more counts as one that helps: near the best place costs are rounding */
+#define SHARPNESS -0.75f /* parameter of the cubic convolution between slices */
 #define ROWS 15 /* of a profile: samples, square of the normal's part across the slices, square of the gap there */
+
+/* The value between four voxels of a slice. */
+static inline float between_voxels(
+    __global const VOXEL *voxels, const int next, const int across, const float fi, const float fj)
+{
+    const float a = (float)voxels[0], b = (float)voxels[across];
+    const float below = a + fi * ((float)voxels[next] - a), above = b + fi * ((float)voxels[across + next] - b);
+    return below + fj * (above - below);
+}
 
 /* Parameters  voxels      in   the slices first_k and following of a volume of (nk, nj, ni)
  *             slices      in   (nk) x y: what i and j are counted from in the slice, in the steps of slice 0; z: its height,
@@ -34,7 +46,7 @@
  *                              part across the slices; square of the gap there, in units of usual_gap
  *             ni nj nk, first_k
  * Launch      global = count rounded up by the host, any local
- * Assumes     all slices that a profile meets are there
+ * Assumes     all slices that a profile meets are there; with CUBIC one more on either side
  * Guarantees  every row of every place is written */
 __kernel void sample_profiles(
     __global const VOXEL *restrict voxels, __global const float4 *restrict slices,
@@ -68,11 +80,23 @@ __kernel void sample_profiles(
         const int next = li + 1 < ni, across = lj + 1 < nj ? ni : 0;
         __global const VOXEL *low = voxels + voxel_index(li, lj, layer - first_k, ni, nj);
         __global const VOXEL *high = nk > 1 ? low + (size_t)ni * (size_t)nj : low;
-        const float a = (float)low[0], b = (float)low[across], c = (float)high[0], d = (float)high[across];
-        const float ab = a + fi * ((float)low[next] - a), bb = b + fi * ((float)low[across + next] - b);
-        const float cb = c + fi * ((float)high[next] - c), db = d + fi * ((float)high[across + next] - d);
-        const float under = ab + fj * (bb - ab), over = cb + fj * (db - cb);
-        profiles[(size_t)n * stride + item] = is_within ? under + fk * (over - under) : NAN;
+        const float under = between_voxels(low, next, across, fi, fj);
+        const float over = between_voxels(high, next, across, fi, fj);
+        float value = under + fk * (over - under);
+#ifdef CUBIC
+        if (layer > 0 && layer + 2 < nk
+            && fabs(slices[layer - 1].w - below.w) <= 0.01f * below.w && fabs(above.w - below.w) <= 0.01f * below.w) {
+            value = 0.0f;
+            for (int m = -1; m < 3; ++m) {
+                const float d = fabs(fk - (float)m);
+                const float near = ((SHARPNESS + 2.0f) * d - (SHARPNESS + 3.0f)) * d * d + 1.0f;
+                const float far = SHARPNESS * (((d - 5.0f) * d + 8.0f) * d - 4.0f);
+                value += (d < 1.0f ? near : far)
+                    * between_voxels(voxels + voxel_index(li, lj, layer + m - first_k, ni, nj), next, across, fi, fj);
+            }
+        }
+#endif
+        profiles[(size_t)n * stride + item] = is_within ? value : NAN;
     }
 }
 

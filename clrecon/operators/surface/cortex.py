@@ -284,20 +284,24 @@ def expected_precisions(cortex_hu: float, noise_hu: float, cortex_spread: float)
     return outer, cortex, inner
 
 
-def prepare_profiles(device: Device, dtype: DTypeLike = np.int16) -> Program:
-    variants = {**voxel_variants(dtype), "LANES": device.kernel_variants["LANES"]}
+def prepare_profiles(device: Device, dtype: DTypeLike = np.int16, *, cubic: bool = False) -> Program:
+    variants = {**voxel_variants(dtype), "LANES": device.kernel_variants["LANES"], **({"CUBIC": "1"} if cubic else {})}
     return load_program(device, "surface/cortex.cl", variants)
 
 
 class ProfileSampler:
-    """Samples profiles of a volume on a device, slab by slab where it does not fit as a whole; the same bits then."""
+    """Samples profiles of a volume on a device, slab by slab where it does not fit as a whole; the same bits then.
 
-    def __init__(self, resident: DeviceVolume, stopwatch: Stopwatch):
+    cubic: Values between slices are those of a cubic convolution of four, not linear ones of two.
+    """
+
+    def __init__(self, resident: DeviceVolume, stopwatch: Stopwatch, *, cubic: bool = False):
         self._resident, self._stopwatch = resident, stopwatch
+        self._cubic = cubic
         self.device = resident.device
         self.scale, self.frame = ProfileScale.of(resident.volume), StackFrame(resident.volume)
         with stopwatch.timed("build"):
-            self.program = prepare_profiles(self.device, resident.dtype)
+            self.program = prepare_profiles(self.device, resident.dtype, cubic=cubic)
 
     def pieces(
         self, points: NDArray[np.floating], normals: NDArray[np.floating]
@@ -306,7 +310,7 @@ class ProfileSampler:
         resident, nk = self._resident, self._resident.volume.shape_ijk[2]
         places, directions = self.frame.places(points), self.frame.directions(normals)
         least_gap = float(self.frame.gaps.min()) if nk > 1 else 1.0
-        reach = int(np.ceil(-self.scale.first_mm / least_gap)) + 1
+        reach = int(np.ceil(-self.scale.first_mm / least_gap)) + 1 + self._cubic
         piece = min(PIECE, len(points))
 
         def needs(slices: int) -> dict[str, int]:

@@ -66,7 +66,9 @@ cortex below which a wall is not of bone alone: a vessel with contrast medium or
 
 _STEPPED = 1.5
 """Slices that blur across by more than so often what they blur within make steps of slanted walls, whose normals are 30
-to 40 degrees off: the fit is made again along those of the moved surface, as means over the triangles around."""
+to 40 degrees off: the fit is made again along those of the moved surface, as means over the triangles around.  Values
+between slices are then those of a cubic convolution: linear ones are blurred by more (with slices of 4 mm 0.38 mm off
+for 0.35)."""
 
 LEAST_ROOM = 2
 """Samples outside of a vertex that belong to its wall, at least."""
@@ -120,12 +122,14 @@ def fit_walls(
     stopwatch: Stopwatch,
     constants: CortexConstants | None = None,
     components: NDArray[np.integer] | None = None,
+    cubic: bool = False,
 ) -> CortexFit:
     """Find the outer surface of bone across points of a surface at a low level.
 
     points, normals: ndarray, shape (n, 3). LPS mm, and unit vectors outwards.
     constants: Those of the scan; None: measured.
     components: ndarray, shape (n,). Those of the points, of which large ones may have a cortex of their own.
+    cubic: Fit profiles whose values between slices are those of a cubic convolution; constants are of linear ones.
     """
     sampler = ProfileSampler(resident, stopwatch)
     if constants is None:
@@ -138,6 +142,8 @@ def fit_walls(
     marks = np.empty(count, np.uint8), np.empty(count, bool)
     fit = CortexFit(constants, levels, *marks, *(np.empty(count, np.float32) for _ in range(5)))
     steep = np.square(normals @ sampler.frame.normal)
+    if cubic:
+        sampler = ProfileSampler(resident, stopwatch, cubic=True)
     for members, known in groups:
         for piece, values_d in sampler.pieces(points[members], normals[members]):
             rows = members[piece]
@@ -390,7 +396,7 @@ def fit_mesh(
     if fit.constants.blur_across_mm > _STEPPED * fit.constants.blur_mm:
         around = fans.sums(vertex_normals(calm, mesh.triangles), mesh.triangles, np.arange(mesh.vertex_count))
         normals = around / np.maximum(np.linalg.norm(around, axis=1, keepdims=True), np.float32(1e-12))
-        fit = fit_along(normals, constants=fit.constants)
+        fit = fit_along(normals, constants=fit.constants, cubic=True)
         wanted, calm = _place_vertices(fit, mesh, normals, fans)
     steps.take()
     vertices, _ = move_vertices(

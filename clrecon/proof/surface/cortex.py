@@ -14,6 +14,9 @@ Float64Array = NDArray[np.float64]
 
 SAMPLES, CENTRE = 13, 7
 
+SHARPNESS = -0.75
+"""Parameter of the cubic convolution between slices."""
+
 INNER_SHARE = 0.25
 """Expected HU of marrow, as a share of those of cortex."""
 
@@ -34,10 +37,19 @@ class Scale:
     weights: NDArray[np.floating]
 
 
+def _convolution(distance: Float64Array) -> Float64Array:
+    """Return the weights of the cubic convolution of Keys 1981 at distances of 0 to 2 slices."""
+    near = (SHARPNESS + 2.0) * distance**3 - (SHARPNESS + 3.0) * distance**2 + 1.0
+    far = SHARPNESS * (distance**3 - 5.0 * distance**2 + 8.0 * distance - 4.0)
+    return np.where(distance < 1.0, near, far)
+
+
 def sample_profiles(
-    volume: Volume, points: NDArray[np.floating], normals: NDArray[np.floating], scale: Scale
+    volume: Volume, points: NDArray[np.floating], normals: NDArray[np.floating], scale: Scale, *, cubic: bool = False
 ) -> Float64Array:
     """Return the profiles, shape (SAMPLES + 2, n), as cl/surface/cortex.cl has them."""
+    normal = slice_normal(volume.affine)
+    heights = np.abs(np.diff(volume.slice_origins() @ normal))
     last = np.array(volume.shape_ijk) - 1
     profiles = np.empty((SAMPLES + 2, len(points)))
     voxels = volume.voxels.astype(np.float64)
@@ -48,14 +60,20 @@ def sample_profiles(
         low = np.minimum(clamped.astype(int), np.maximum(last - 1, 0))
         share, high = clamped - low, np.minimum(low + 1, last)
         value = np.zeros(len(points))
-        for corner in range(8):
-            upper = [bool(corner >> axis & 1) for axis in range(3)]
-            i, j, k = (high[:, axis] if up else low[:, axis] for axis, up in enumerate(upper))
-            weight = np.prod([share[:, axis] if up else 1.0 - share[:, axis] for axis, up in enumerate(upper)], axis=0)
-            value += weight * voxels[k, j, i]
+        k = low[:, 2]
+        gaps = np.stack([heights[np.clip(k + step, 0, len(heights) - 1)] for step in (-1, 0, 1)])
+        alike = (np.abs(gaps[1] / gaps - 1.0) <= 0.01).all(axis=0)
+        curved = cubic & (k > 0) & (k + 2 <= last[2]) & alike
+        for step in range(-1, 3):
+            distance = np.abs(share[:, 2] - step)
+            weight = np.where(curved, _convolution(distance), np.maximum(1.0 - distance, 0.0))
+            in_slice = np.zeros(len(points))
+            for upper in np.ndindex(2, 2):
+                i, j = ((high if up else low)[:, axis] for axis, up in enumerate(upper))
+                parts = [share[:, axis] if up else 1.0 - share[:, axis] for axis, up in enumerate(upper)]
+                in_slice += parts[0] * parts[1] * voxels[np.clip(k + step, 0, last[2]), j, i]
+            value += weight * in_slice
         profiles[n] = np.where(inside, value, np.nan)
-    normal = slice_normal(volume.affine)
-    heights = np.abs(np.diff(volume.slice_origins() @ normal))
     layers = np.clip(np.floor(volume.lps_to_ijk(points)[:, 2]).astype(int), 0, len(heights) - 1)
     profiles[SAMPLES] = np.square(normals @ normal)
     profiles[SAMPLES + 1] = np.square(heights[layers] / np.median(heights))

@@ -360,13 +360,13 @@ def scatter_profiles(volume: Volume, seed: int) -> tuple[NDArray[np.float32], ND
     return points.astype(np.float32), normals.astype(np.float32)
 
 
-def _check_profiles(device: Device, dtype: str, uneven: bool) -> str:
+def _check_profiles(device: Device, dtype: str, uneven: bool, cubic: bool) -> str:
     volume = blobs((30, 34, 38), OBLIQUE, dtype, uneven=uneven)
     points, normals = scatter_profiles(volume, 31)
     with DeviceVolume(volume, device=device) as resident:
-        sampler = ProfileSampler(resident, Stopwatch())
+        sampler = ProfileSampler(resident, Stopwatch(), cubic=cubic)
         profiles = sampler.values(points, normals)
-    expected = cortex_twin.sample_profiles(volume, points, normals, twin_scale(sampler))
+    expected = cortex_twin.sample_profiles(volume, points, normals, twin_scale(sampler), cubic=cubic)
     share = 0.002  # at the border a sample is in the volume or not
     worst = require_share(profiles, expected, _VALUE_TOLERANCE_HU, share, f"profiles of {dtype} voxels")
     return f"{PLACES} profiles of {dtype} voxels within {worst:.1e} HU"
@@ -416,10 +416,13 @@ def _check_fits(device: Device) -> str:
 CORTEX_CHECKS = (
     *(
         Check(
-            f"profiles across walls, {dtype}{', uneven slices' * uneven}", ("sample_profiles",),
-            partial(_check_profiles, dtype=dtype, uneven=uneven),
+            f"profiles across walls, {dtype}{', uneven slices' * uneven}{', cubic' * cubic}", ("sample_profiles",),
+            partial(_check_profiles, dtype=dtype, uneven=uneven, cubic=cubic),
+            variants={"surface/cortex.cl": ("CUBIC",) * cubic},
         )
-        for dtype, uneven in (("int16", False), ("float32", True))
+        for dtype, uneven, cubic in (
+            ("int16", False, False), ("float32", True, False), ("int16", False, True), ("float32", True, True)
+        )
     ),
     Check("walls fitted to profiles", ("fit_profiles",), _check_fits),
 )  # fmt: skip
