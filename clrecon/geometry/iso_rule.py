@@ -23,7 +23,7 @@ from clrecon.geometry.vertices import (
 from clrecon.geometry.volume import Volume
 from clrecon.system.arguments import Topology
 from clrecon.system.light_dataclass import dataclass, replace
-from clrecon.system.text import format_digits
+from clrecon.system.text import format_digits, format_hu
 
 LARGEST_INTEGER = 2**23
 """Integer voxels are interpolated in float32, which holds multiples of 0.5 exactly up to here."""
@@ -130,6 +130,15 @@ def data_range(volume: Volume) -> tuple[float, float]:
         low, high = min(low, lowest), max(high, highest)
         volume.release_slices(k, k + 1)
     return low, high
+
+
+def describe_range(volume: Volume, low: float, high: float) -> str:
+    """Say which HU the volume has, and what has left no more than that of the scan, such as a crop in another frame."""
+    crop, region = volume.report.get("crop"), volume.report.get("region")
+    causes = [] if crop is None else [f"the crop ({crop['space'].upper()})"]
+    causes += [] if region is None else [f"the region {' '.join(region['rules'])}"]
+    rest = f"what {' and '.join(causes)} leave{'s' * (len(causes) == 1)}" if causes else "the volume"
+    return f"{rest} runs from {format_hu(low)} to {format_hu(high)} HU"
 
 
 def _lowest_value(volume: Volume) -> float:

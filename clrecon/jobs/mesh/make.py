@@ -15,6 +15,7 @@ import numpy as np
 from clrecon.errors import DeviceError, DeviceFailedError, NoSurfaceError, UsageError
 from clrecon.geometry import frame_from_lps
 from clrecon.geometry.certificate import amend
+from clrecon.geometry.iso_rule import describe_range
 from clrecon.jobs.inputs import read_with_labels
 from clrecon.jobs.mesh.bone import find_bone
 from clrecon.jobs.mesh.labels import extract_label_surfaces, open_labels
@@ -29,7 +30,7 @@ from clrecon.system.arguments import name_parameter
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.pieces import local_origin
 from clrecon.system.progress import Progress, Steps, ignore_progress
-from clrecon.system.text import format_hu, format_ml
+from clrecon.system.text import format_ml
 
 if TYPE_CHECKING:
     from clrecon.anatomy.iso_choice import IsoChoice
@@ -319,10 +320,8 @@ def check_levels(volume: Volume, surfaces: Sequence[Surface]) -> None:
         else:
             all_inside = level > high if surface.below else level <= low
         if all_inside:  # the surface would be the box of the scan
-            raise NoSurfaceError(
-                f"no surface {surface.phrase}: every voxel is inside, the volume runs from"
-                f" {format_hu(low)} to {format_hu(high)} HU"
-            )
+            runs = describe_range(volume, low, high)
+            raise NoSurfaceError(f"no surface {surface.phrase}: every voxel is inside, {runs}")
 
 
 def extract_surfaces(

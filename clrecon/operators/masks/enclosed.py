@@ -11,7 +11,7 @@ from clrecon.anatomy.iso_choice import settle_level
 from clrecon.errors import NoSurfaceError
 from clrecon.geometry import Volume, slice_voxel_ml
 from clrecon.geometry.certificate import amend
-from clrecon.geometry.iso_rule import choose_iso_rule
+from clrecon.geometry.iso_rule import choose_iso_rule, describe_range
 from clrecon.geometry.regions import find_open_places, holds_ball
 from clrecon.opencl import Device, download, result_pages, upload, wait
 from clrecon.operators.masks.mask import Mask
@@ -24,7 +24,7 @@ from clrecon.system.arguments import explains_arguments, name_parameter
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, Steps
 from clrecon.system.records import at_most
-from clrecon.system.text import count_of, format_hu, format_ml
+from clrecon.system.text import count_of, format_ml
 
 WIDE_ML = 20.0
 """Smaller spaces are not wide: even a disc of 5 mm from the middle of a ball of 35 mm radius has 19 ml."""
@@ -284,8 +284,7 @@ def fill_enclosed(
         if not bone.count or bone.count == scan.voxels.size:
             lack = "no voxel has" if not bone.count else "every voxel has"
             low, high = scan.hu_range or (float(scan.voxels.min()), float(scan.voxels.max()))
-            ends = f"the volume runs from {format_hu(low)} to {format_hu(high)} HU"
-            raise NoSurfaceError(f"{lack} {level:g} HU or more: {ends}")
+            raise NoSurfaceError(f"{lack} {level:g} HU or more: {describe_range(scan, low, high)}")
         seal = seal or _default_seal(scan, bone)
         steps.take()
         filled = _fill_spaces(bone, (seal, largest, keep_air), float(rule.lowest_inside), steps)

@@ -14,7 +14,7 @@ from clrecon.anatomy.head import warn_of_face
 from clrecon.anatomy.iso_choice import settle_level
 from clrecon.errors import DeviceError, DeviceFailedError, DeviceMemoryError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.iso_rule import data_range
+from clrecon.geometry.iso_rule import data_range, describe_range
 from clrecon.geometry.vertices import find_vertex_origin, warnings_of_far
 from clrecon.opencl import Device, Program, Stopwatch
 from clrecon.operators.masks.voxel_mask import band_bounds, checked_band, prepare_classify
@@ -28,7 +28,6 @@ from clrecon.points.cloud import MOST_POINTS, VoxelNumbers
 from clrecon.system.arguments import PointKind, explains_arguments, name_parameter
 from clrecon.system.light_dataclass import dataclass, field
 from clrecon.system.progress import Progress, ignore_progress
-from clrecon.system.text import format_hu
 
 if TYPE_CHECKING:
     from clrecon.labels import LabelMap
@@ -400,10 +399,7 @@ def _voxels(
                 if labels is not None and number:
                     which = f"of label {number} {labels.name(number)} "
                 low, high = data_range(volume)
-                raise NoSurfaceError(
-                    f"no voxel {which}of {_describe_band(band)}: the volume runs from {format_hu(low)} to"
-                    f" {format_hu(high)} HU"
-                )
+                raise NoSurfaceError(f"no voxel {which}of {_describe_band(band)}: {describe_range(volume, low, high)}")
             points = positions if run.origin is None else positions + run.origin
             of_label = None if chosen.labels is None else chosen.labels.reshape(-1)[numbers].astype(np.int32)
             report = {

@@ -14,7 +14,7 @@ from numpy.typing import DTypeLike, NDArray
 from clrecon.anatomy.head import warn_of_face
 from clrecon.errors import ClreconError, DeviceError, DeviceMemoryError, NoSurfaceError
 from clrecon.geometry import Volume
-from clrecon.geometry.iso_rule import IsoRule, data_range
+from clrecon.geometry.iso_rule import IsoRule, data_range, describe_range
 from clrecon.geometry.vertices import warnings_of_far, warnings_of_rule
 from clrecon.opencl import Device, Program, Stopwatch, result_pages
 from clrecon.operators.resident.device_volume import DeviceVolume
@@ -26,7 +26,6 @@ from clrecon.operators.surface.seeds import Seeds
 from clrecon.operators.surface.slabs import BRICKS, SampleGrid, Slab, plan_slabs
 from clrecon.operators.surface.trilinear import prepare_trilinear
 from clrecon.system.progress import Progress
-from clrecon.system.text import format_hu
 
 Part = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]
 """Positions, normals and triangles of one slab."""
@@ -50,7 +49,7 @@ SpanPart = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32], S
 
 def _refuse_level(device: Device, volume: Volume, rule: IsoRule) -> ClreconError:
     low, high = data_range(volume)
-    runs = f"the volume runs from {format_hu(low)} to {format_hu(high)} HU"
+    runs = describe_range(volume, low, high)
     if rule.inside == "between":
         marked = sum(int(np.count_nonzero(rule.mark_inside(voxels))) for voxels in volume.voxels)
         if 0 < marked < volume.voxels.size or (marked and rule.closed):
