@@ -164,7 +164,7 @@ REFUSED = {
     "size that is none": (["--picture", "a.png", "--size", "large"], 3, "large"),
     "picture of an animation": (["--picture", "a.gif"], 3, ".gif"),
     "picture and port": (["--picture", "a.png", "--port", "8000"], 3, "--port"),
-    "saved view that is missing": (["--state", "gone.view.json", "--picture", "a.png"], 4, "gone.view.json"),
+    "saved view that is missing": (["--state", "gone.view.json", "--picture", "a.png"], 3, "gone.view.json"),
 }
 
 

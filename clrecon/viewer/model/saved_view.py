@@ -88,6 +88,8 @@ def read_view(path: str | Path) -> dict[str, Any]:
     name = escape_text(Path(path).name)
     try:
         saved = json.loads(read_regular(path, _LARGEST_FILE))
+    except FileNotFoundError:
+        raise UsageError(f"there is no saved view {escape_text(str(path), 200)}") from None
     except (OSError, ValueError, RecursionError) as error:
         raise RefusedInputError(f"{name} cannot be read as a saved view: {escape_text(str(error), 120)}") from None
     identity = name_schema(_SCHEMA, {})["schema"]

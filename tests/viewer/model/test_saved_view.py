@@ -12,7 +12,7 @@ import view_scenes as scenes
 from refusals import refused
 from report_schemas import find_faults
 
-from clrecon.errors import RefusedInputError
+from clrecon.errors import RefusedInputError, UsageError
 from clrecon.viewer.model.model import ViewModel
 from clrecon.viewer.model.objects import show_objects
 from clrecon.viewer.model.saved_view import encode_view, read_view, restore_view
@@ -232,5 +232,5 @@ def test_file_that_is_no_saved_view_is_refused_by_name(text: str, tmp_path: Path
 
 
 def test_missing_file_of_a_view_is_refused_by_name(tmp_path: Path) -> None:
-    with refused(RefusedInputError, "gone.view.json"):
+    with refused(UsageError, "gone.view.json"):
         read_view(tmp_path / "gone.view.json")
