@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import tolerances
 from label_files import write_nrrd
-from refusals import assert_facts, refused
+from refusals import refused
 
 from clrecon import PointLook, read_mesh, read_points
 from clrecon.cli.main import main
@@ -107,12 +107,12 @@ def test_crop_in_ras_is_that_in_lps_with_x_and_y_turned(scan: Path, tmp_path: Pa
     "words", [("mesh",), ("mesh", "--solid"), ("cloud",), ("cloud", "--points", "voxels")], ids=" ".join
 )
 def test_message_about_missing_bone_names_the_crop_and_its_frame(
-    words: tuple[str, ...], scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    words: tuple[str, ...], scan: Path, tmp_path: Path, printed: Any
 ) -> None:
     command, *options = words
     corner = ("--around", "13,-35,102,2", "--space", "ras")  # of air alone
     assert run(command, scan, "-o", tmp_path / "a.ply", "--hu", "300", "-q", *corner, *options) == 2
-    assert_facts(capsys.readouterr().err, "crop", "RAS")
+    printed().assert_error("crop", "RAS")
 
 
 def test_slab_and_box_are_intersected(scan: Path, tmp_path: Path) -> None:
