@@ -176,7 +176,7 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
     "select_edges": {"chosen": (("= edge;\n}", "= opposite[edge];\n}"),)},
     "collapse_edges": {
         "places": (("places[u] = (float4)(place, 0.0f);", "places[u] = (float4)(-place, 0.0f);"),),
-        "into": (("(uint4)(u, round, entry, own.size)", "(uint4)(w, round, entry, own.size)"),),
+        "into": (("(uint4)(u, number, entry, own.size)", "(uint4)(w, number, entry, own.size)"),),
         "octaves": (("octaves[number] = octave_of(", "octaves[number] = (uchar)~octave_of("),),
         "earlier": (("earlier[w] = places[u];", "earlier[w] = -places[u];"),),
         "neighbours": (("neighbours[entry + i] = own.vertices[i];", "neighbours[entry + i] = u;"),),
