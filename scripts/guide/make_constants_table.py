@@ -41,8 +41,8 @@ LENGTHS = {
     "labels/label_grids.py": WRITERS,
     "labels/segmentation.py": WRITERS,
     "labels/structures.py": "voxel: distance to the next slice; otherwise how programs round in files",
-    "operators/masks/enclosed.py": "voxel: the ball of `--solid` has a radius of at most 8 steps; object: volume of the"
-    " bone; otherwise chosen for marrow of adults",
+    "operators/masks/enclosed.py": "voxel: the ball of `--solid` has a radius of at most 8 times the largest voxel"
+    " step; object: volume of the bone; otherwise chosen for marrow of adults",
     "operators/masks/regions.py": WRITERS,
     "operators/masks/shapes.py": WRITERS,
     "operators/points/clusters.py": WRITERS,

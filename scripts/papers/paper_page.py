@@ -59,7 +59,7 @@ _TIMES = """## Paper B, time
 Paper B gives its times in Tables 2 and 3, as images without legible numbers. So the tables here have only clrecon's
 times, in seconds, from the voxels in memory to the mesh in memory. "First" is the first call in a new process, "later"
 is the median of later calls. The last column is the number of cells of the volume, divided by the number of cells that
-I-MC visits."""
+I-MC visits with automatic seeds."""
 
 _ACCURACY = """## Paper B, accuracy
 
@@ -208,7 +208,7 @@ def _accuracy(report: Report) -> list[str]:
         )
         for row in _done(report) if row["cells"]
     ]  # fmt: skip
-    head = ("method", "recall of cells", "precision", "Dice", "bias, mm", "scatter, mm")
+    head = ("method", "recall of cells", "precision of cells", "Dice of cells", "bias, mm", "scatter, mm")
     return [f"{_BEFORE['b149']} {SETS['b149'].what}, iso value {report['iso_value_hu']:g} HU:", _table(head, rows)]
 
 
@@ -236,8 +236,8 @@ def _times(reports: Mapping[str, Report], growing: Mapping[str, Any] | None) -> 
             for each in growing["rows"]
         ]  # fmt: skip
         tables += [
-            f"The next table is for I-MC with seeds in some of the vertebrae of the phantom of {SETS['b559'].what}. "
-            "T-MC makes the whole surface. Both start from a volume on the device:",
+            "The next table is for I-MC with one seed on the outer surface of each of 1 to 17 vertebrae of the phantom "
+            f"of {SETS['b559'].what}. T-MC makes the whole surface. Both start from a volume on the device:",
             _table(
                 ("vertebrae with seeds", "cells visited", "cells / cells visited", "time of I-MC / time of T-MC"), rows
             ),
