@@ -22,8 +22,9 @@ if TYPE_CHECKING:
     from clrecon.jobs.batch.scheduler import Outcome
 
 _EPILOG = f"""\
-A manifest is a table in UTF-8 with commas, whose first line names the columns {", ".join(COLUMNS)}; series and labels
-may be left out. Paths start at its folder. Of a folder each series of CT slices is a case, named by its number.
+A manifest is a table in UTF-8 with commas or semicolons. Its first line names the columns {", ".join(COLUMNS)};
+series and labels may be left out. Paths start at its folder. Of a folder each series of CT slices is a case, named by
+its number.
 
 OUT/CASE holds the mesh, a picture, with labels a table of them, and case.json, all or nothing. OUT/cohort.csv and
 OUT/cohort.html show all cases, and name no file and no patient. See docs/batch.md.

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from clrecon.errors import OutputError, UsageError
+from clrecon.system.text import escape_character
 
 _LABEL = re.compile(r"\s*\S+(?: \S+){0,2}\s{2,}|exit codes: |\s*")
 _COMMAND = re.compile(r"\s*clrecon \S")
@@ -141,7 +142,7 @@ _REDRAW_SECONDS = 0.1
 def printable(text: object) -> str:
     """Return `text` on one line, with control and direction characters as escapes: files can hold terminal codes."""
     return "".join(
-        char if char.isprintable() and ord(char) not in _HIDDEN else char.encode("unicode_escape").decode("ascii")
+        char if char.isprintable() and ord(char) not in _HIDDEN else escape_character(char)
         for char in " ".join(str(text).splitlines())
     )
 

@@ -20,7 +20,7 @@ from typing import BinaryIO
 
 from clrecon.errors import OutputError, UsageError
 from clrecon.system.arguments import name_parameter
-from clrecon.system.text import guess_word
+from clrecon.system.text import escape_character, guess_word
 
 # A pipe or device put in the place of a file must not make the reader wait for a writer.
 _READ = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
@@ -34,11 +34,15 @@ def extension_of(path: str | os.PathLike[str]) -> str:
 def find_extension(path: str | os.PathLike[str], known: Iterable[str], noun: str, hint: str = "") -> str:
     """Return the extension of a file to write, one of those known; a refusal names the `noun` ("mesh") and `hint`."""
     try:
-        extension = extension_of(path)
+        extension, name = extension_of(path), os.path.basename(path)
     except TypeError as error:
         raise UsageError(f"a {noun} file is named by a string or a path, not {type(path).__name__}") from error
     if extension not in known:
         ending = f"the extension {extension!r}{hint or guess_word(extension, known)}" if extension else "no extension"
+        if os.fspath(path) and not name:
+            raise UsageError(f"the name of the {noun} file ends with a slash, as that of a folder: name a file in it")
+        if name.lower() in known:
+            raise UsageError(f"the name of the {noun} file is only an extension: put a name before {name}")
         raise UsageError(f"the name of the {noun} file has {ending}: use one of {', '.join(known)}")
     return extension
 
@@ -123,7 +127,7 @@ def refuse_existing(path: str | os.PathLike[str], target: Path) -> None:
 
 def shown_path(path: str | os.PathLike[str]) -> str:
     """Return the path as a message shows it: one line without terminal control characters."""
-    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in os.fspath(path))
+    return "".join(c if c.isprintable() else escape_character(c) for c in os.fspath(path))
 
 
 @contextlib.contextmanager

@@ -17,8 +17,14 @@ def escape_text(text: str, limit: int = _TEXT_LIMIT) -> str:
     r"""Return `text` in one printable line of at most `limit` characters, others as ``\xNN`` or ``\uNNNN``."""
     if text.isprintable() and len(text) <= limit:
         return text
-    safe = "".join(c if c.isprintable() else c.encode("unicode_escape", "replace").decode("ascii") for c in text)
+    safe = "".join(c if c.isprintable() else escape_character(c) for c in text)
     return safe if len(safe) <= limit else safe[: limit - 3] + "..."
+
+
+def escape_character(character: str) -> str:
+    r"""Return the code of a character; of a byte of a file name that is no letter in this locale, ``\xNN``."""
+    code = ord(character)
+    return f"\\x{code & 0xFF:02x}" if 0xDC80 <= code <= 0xDCFF else character.encode("unicode_escape").decode("ascii")
 
 
 def guess_word(word: object, known: Iterable[str]) -> str:

@@ -52,6 +52,7 @@ def make_raising_action(error: BaseException):  # noqa: ANN201
         ("gpj.\u202eexe", "gpj.\\u202eexe"),
         ("Größe 3", "Größe 3"),
         ("nul\0", "nul\\x00"),
+        ("\udcc3\udca4.ply", "\\xc3\\xa4.ply"),  # ä where the locale is C
     ],
 )
 def test_control_characters_of_a_text_are_printed_as_codes(text: str, shown: str) -> None:

@@ -216,8 +216,7 @@ PLACES = {
     "rows and columns exchanged": seen("Rows and Columns seem to be swapped", Rows=96, Columns=72),
     "SeriesInstanceUID missing": exact("", "no SeriesInstanceUID", SeriesInstanceUID=None),
     "a series for each slice": refused(
-        "a single slice cannot make a surface: 12 series of one slice each",
-        SeriesInstanceUID=lambda k: f"1.2.3.{k + 1}",
+        "a single slice cannot make a volume: 12 series of one slice each", SeriesInstanceUID=lambda k: f"1.2.3.{k + 1}"
     ),
     "two series alternate": refused("2 CT series have 6 slices each", SeriesInstanceUID=lambda k: f"1.2.3.{k % 2 + 1}"),
     "acquisitions alternate": refused(

@@ -270,11 +270,13 @@ def _read_table(path: str | Path) -> list[Case]:
             cases = _read_parquet(name, path, folder)
         else:
             with io.TextIOWrapper(open_regular(path), "utf-8-sig", newline="") as stream:
-                table = csv.reader(stream, strict=True)
+                delimiter = ";" if ";" in stream.readline() else ","  # no name of a column has one
+                stream.seek(0)
+                table = csv.reader(stream, delimiter=delimiter, strict=True)
                 places = _find_columns(name, next(table, []))
                 cases = _read_rows(name, ((table.line_num, row) for row in table), places, folder)
     except (UnicodeDecodeError, csv.Error) as error:
-        raise UsageError(f"the manifest {name} is no table in UTF-8 with commas: {error}") from None
+        raise UsageError(f"the manifest {name} is no table in UTF-8 with commas or semicolons: {error}") from None
     except OSError as error:
         raise UsageError(f"the manifest {name} cannot be read: {error.strerror or error}") from None
     if not cases:

@@ -398,8 +398,8 @@ def _voxels(
                 which = "" if labels is None else "of a label "
                 if labels is not None and number:
                     which = f"of label {number} {labels.name(number)} "
-                low, high = data_range(volume)
-                raise NoSurfaceError(f"no voxel {which}of {_describe_band(band)}: {describe_range(volume, low, high)}")
+                runs = describe_range(volume, *data_range(volume))
+                raise NoSurfaceError(f"no voxel {which}of {_describe_band(band)}: {runs}")
             points = positions if run.origin is None else positions + run.origin
             of_label = None if chosen.labels is None else chosen.labels.reshape(-1)[numbers].astype(np.int32)
             report = {

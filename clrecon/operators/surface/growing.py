@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from clrecon import opencl as ocl
 from clrecon.errors import DeviceMemoryError, NoSurfaceError, UsageError
+from clrecon.geometry.iso_rule import data_range, describe_range
 from clrecon.opencl import Device, Program, Stopwatch
 from clrecon.operators.primitives.scan import enqueue_scan, exclusive_scan, prepare_scan
 from clrecon.operators.resident.device_volume import DeviceVolume
@@ -341,7 +342,8 @@ def grow(resident: DeviceVolume, grid: SampleGrid, classified: Classified, seeds
     search = _Search(resident, grid, classified)
     runs = search.find_runs()
     if runs.total == 0:
-        raise NoSurfaceError(f"no surface {grid.rule.phrase()} to grow")
+        runs_from = describe_range(resident.volume, *data_range(resident.volume))
+        raise NoSurfaceError(f"no surface {grid.rule.phrase()} to grow: {runs_from}")
     components = search.join(runs)
     choose_components(resident.device, grid, classified, runs, components, seeds)
     grown_d, extents_d, visited_d = search.mark(runs, components)

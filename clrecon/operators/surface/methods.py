@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from clrecon.anatomy.iso_choice import AutoLevel, settle_level
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume, is_left_handed
-from clrecon.geometry.iso_rule import IsoRule, Level, choose_iso_rule
+from clrecon.geometry.iso_rule import IsoRule, Level, choose_iso_rule, data_range, describe_range
 from clrecon.geometry.vertices import linear_fraction
 from clrecon.mesh import Mesh
 from clrecon.mesh.triangles import vertex_normals
@@ -250,7 +250,7 @@ def _extract_on_host(volume: Volume | DeviceVolume, iso_value: Level, method: st
         extracted = time.perf_counter()
         vertices, triangles = weld(soup)
     if not len(triangles):
-        raise NoSurfaceError(f"no surface {rule.phrase()}")
+        raise NoSurfaceError(f"no surface {rule.phrase()}: {describe_range(scan, *data_range(scan))}")
     welded = time.perf_counter()
     every = int(np.prod([n + 2 * rule.border - 1 for n in scan.shape_ijk]))
     report = {
@@ -281,7 +281,8 @@ def _extract_by_skimage(volume: Volume, rule: IsoRule) -> tuple[np.ndarray[Any, 
     try:
         points, faces, _, _ = marching_cubes(values, rule.iso_level, allow_degenerate=False)
     except (ValueError, RuntimeError) as error:
-        raise NoSurfaceError(f"no surface {rule.phrase()}: {error}") from error
+        runs = describe_range(volume, *data_range(volume))
+        raise NoSurfaceError(f"no surface {rule.phrase()}: {runs}") from error
     vertices = volume.ijk_to_lps(points[:, ::-1].astype(np.float64) - rule.border)
     # In (k, j, i) its triangles are counter-clockwise as seen from higher values; reversing the axes mirrors them.
     triangles = faces[:, ::-1] if is_left_handed(volume.affine) else faces

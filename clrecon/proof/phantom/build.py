@@ -24,7 +24,7 @@ from clrecon.proof.phantom.spine import BLOOD_HU, draw_spine, label_levels
 from clrecon.proof.phantom.spine_parts import Anatomy, level_number
 from clrecon.proof.phantom.vertebra import bone_points
 from clrecon.system.files import temporary_folder
-from clrecon.system.paths import existing_stay, place_folder, read_regular, refuse_existing, resolve_target
+from clrecon.system.paths import existing_stay, place_folder, read_regular, refuse_existing, resolve_target, shown_path
 from clrecon.system.progress import Progress
 from clrecon.system.text import count_of
 from clrecon.version import package_version
@@ -213,14 +213,14 @@ def is_phantom_truth(truth: Any) -> bool:
     return isinstance(truth, dict) and truth.get("generator") == _GENERATOR
 
 
-def _check_replaceable(folder: Path) -> None:
+def _check_replaceable(folder: Path, shown: str) -> None:
     """Accept a folder that is absent, empty, or holds an earlier phantom and nothing else."""
     if not folder.parent.is_dir():
-        raise OutputError(f"cannot write {folder.name}: the folder around it does not exist; make it first")
+        raise OutputError(f"cannot write {shown}: the folder around it does not exist; make it first")
     if not folder.exists():
         return
     if not folder.is_dir():
-        raise OutputError(f"cannot write {folder.name}: a file of that name exists; give a new folder")
+        raise OutputError(f"cannot write {shown}: a file of that name exists; give a new folder")
     if folder == Path.cwd():
         raise UsageError("cannot write into the current folder: give a new or empty folder")
     names = sorted(entry.name for entry in folder.iterdir())
@@ -247,10 +247,10 @@ def write_phantom(
     The series is written into a temporary folder beside `out_folder`, read back, and then renamed: `out_folder`, new,
     empty or with an earlier phantom and nothing else (then replaced), is either complete or untouched.
     """
-    folder = resolve_target(out_folder)
+    folder, shown = resolve_target(out_folder), shown_path(out_folder)
     try:
-        _check_replaceable(folder)
-        refuse_existing(folder.name, folder)
+        _check_replaceable(folder, shown)
+        refuse_existing(shown, folder)
         placement = place_slices(settings)
         voxels, truth, labels = _make_voxels(settings, placement, progress)
         with temporary_folder(folder.parent) as temporary:
@@ -267,8 +267,8 @@ def write_phantom(
                 names = {level_number(name): name for name in settings.spine_choice.levels}
                 levels = label_levels(settings, placement.affine)
                 write_label_map(finished / _LEVELS_NAME, levels, placement.affine, names)
-            place_folder(finished, folder, folder.name, keep=existing_stay())
+            place_folder(finished, folder, shown, keep=existing_stay())
     except OSError as error:
         reason = error.strerror or type(error).__name__
-        raise OutputError(f"the phantom cannot be written to {folder.name}: {reason}") from error
+        raise OutputError(f"the phantom cannot be written to {shown}: {reason}") from error
     return truth

@@ -29,6 +29,7 @@ from clrecon.proof.phantom.spine_parts import Vertebra, level_number
 from clrecon.proof.phantom.vertebra import local_bounds, vertebra_distance, vertebra_shape
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.paths import read_regular
+from clrecon.system.text import escape_text
 
 Float64Array = NDArray[np.float64]
 
@@ -353,6 +354,9 @@ def _read_truth(folder: Path) -> tuple[PhantomSettings, dict[str, Any]]:
         if not is_phantom_truth(known):
             raise UsageError(f"{name} is not of a phantom")
         return PhantomSettings(**known["settings"]), known
+    except FileNotFoundError:
+        missing = folder / TRUTH_NAME if folder.is_dir() else folder
+        raise UsageError(f"there is no truth of a phantom {escape_text(str(missing), 200)}") from None
     except OSError as error:
         raise UsageError(f"{name} cannot be read: {error.strerror or type(error).__name__}") from error
     except ClreconError:

@@ -32,6 +32,11 @@ def test_paths_of_a_table_start_at_its_folder_and_further_columns_may_be_empty(t
     ]
 
 
+def test_table_with_semicolons_as_excel_writes_it_in_many_countries_is_read(tmp_path: Path) -> None:
+    cases = read_table(tmp_path, "\ufeffcase;input;series\r\nP-1;/ct/a,b;7\r\n")
+    assert cases == [Case("P-1", "/ct/a,b", "7", None)]
+
+
 BAD_TABLES = {
     "unknown columns": ("case,input,hu,sereis\na,b,1,2\n", ("hu", "sereis", "series")),
     "no column of inputs": ("case,series\na,b\n", ("input",)),

@@ -381,7 +381,8 @@ def test_iso_value_without_a_surface_is_refused_before_any_method_runs(
         ("--hu 100:300", "compared at one iso value"),
         ("--hu 100,300", "compared at one iso value"),
         ("--hu 100 --preset bone", "not allowed with"),
-        ("--truth nowhere/truth.json", "truth.json cannot be read"),
+        ("--truth nowhere/truth.json", "there is no truth of a phantom nowhere\n"),
+        ("--truth nosuch.json", "there is no truth of a phantom nosuch.json\n"),
     ],
 )
 def test_wrong_option_of_a_comparison_is_refused_in_one_line_before_input_and_device_are_looked_for(

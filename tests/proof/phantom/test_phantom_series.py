@@ -256,7 +256,7 @@ def test_folder_with_files_that_are_no_phantom_is_refused_and_left(
 
 
 def test_phantom_below_a_missing_folder_is_refused(tmp_path: Path) -> None:
-    with refused(OutputError, "exist"):
+    with refused(OutputError, str(tmp_path / "missing" / "ct"), "exist"):
         write_phantom(tmp_path / "missing" / "ct", SPHERE)
     assert list(tmp_path.iterdir()) == []
 

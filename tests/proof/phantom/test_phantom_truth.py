@@ -216,7 +216,7 @@ def test_truth_file_that_is_not_of_a_phantom_is_refused(tmp_path: Path, text: st
 
 
 def test_truth_of_a_folder_without_one_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="cannot be read"):
+    with pytest.raises(UsageError, match=f"there is no truth of a phantom {tmp_path}/truth.json"):
         clrecon.phantom_truth(tmp_path)
 
 

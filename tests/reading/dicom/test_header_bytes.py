@@ -341,12 +341,9 @@ def test_reply_of_a_decoder_is_written_whole_to_a_full_pipe():
         ("stack", 1, ["bad 0"]),  # what it leaves would only hide the cause
         ("localizer", 0, ["localizer images, not a stack", "lost"]),
         ("localizer", 1, ["bad 0", "localizer images, not a stack"]),
-        ("stack", PROBLEMS_SHOWN, [f"bad {n}" for n in range(PROBLEMS_SHOWN)]),
-        (
-            "stack",
-            PROBLEMS_SHOWN + 2,
-            [f"bad {n}" for n in range(PROBLEMS_SHOWN)] + ["and 2 more files with a problem"],
-        ),
+        ("stack", PROBLEMS_SHOWN, SHOWN),
+        ("stack", PROBLEMS_SHOWN + 1, [*SHOWN, "and 1 more file with a problem"]),
+        ("stack", PROBLEMS_SHOWN + 2, [*SHOWN, "and 2 more files with a problem"]),
     ],
 )
 def test_problems_of_a_series_are_listed_without_those_that_hide_the_cause(kind, bad, expected):

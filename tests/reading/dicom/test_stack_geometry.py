@@ -107,7 +107,7 @@ STACKS_WITH_HOLES = pytest.mark.parametrize(
         (Plan(leave_out=(2,)), MISSING),
         (Plan(shape=(12, 3, 3), leave_out=(3, 4)), "2 slices missing between -397.50 and -393.75 mm (gap 3.750 mm"),
         (Plan(shape=(12, 3, 3), leave_out=(3, 8)), "; 1 slice missing between -391.25 and -388.75 mm"),
-        (Plan(shape=(1, 4, 4)), "a single slice cannot make a surface"),
+        (Plan(shape=(1, 4, 4)), "a single slice cannot make a volume"),
     ],
     ids=["hole", "hole of two", "two holes", "single"],
 )

@@ -160,6 +160,8 @@ def test_values_of_a_picture_without_any_are_refused(tmp_path):
     [
         (lambda picture, folder: picture.save(folder / "a.bmp"), "use one of .png, .jpg"),
         (lambda picture, folder: picture.save(folder / "a"), "no extension"),
+        (lambda picture, folder: picture.save(f"{folder}/a.png/"), "slash"),
+        (lambda picture, folder: picture.save(folder / ".PNG"), "only an extension"),
         (lambda picture, folder: picture.save(5), "string or a path"),
         (lambda picture, folder: picture.save(folder / "a.jpg", quality=0), "between 1 and 100"),
         (lambda picture, folder: picture.save_depth(folder / "a.png"), "use one of .npy, .tif"),

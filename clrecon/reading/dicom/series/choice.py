@@ -146,7 +146,7 @@ def _take_best(candidates: Sequence[Series]) -> Choice:
     most = max(series.count for series in stacks)
     near = [(series, rank_series(series)) for series in stacks if series.count >= _SIMILAR * most and series.count > 1]
     if not near:
-        raise RefusedInputError(f"a single slice cannot make a surface: {len(stacks)} series of one slice each")
+        raise RefusedInputError(f"a single slice cannot make a volume: {len(stacks)} series of one slice each")
     best, why = _sift(near)
     if len(best) == 1:
         return Choice(best[0], why)  # a fault does not exclude the series: read_volume refuses it

@@ -39,7 +39,7 @@ from clrecon.reading.dicom.stack.fit import Stack, group_places, measure_stack, 
 from clrecon.reading.dicom.stack.mixtures import alternate_places, find_alternation
 from clrecon.system.light_dataclass import dataclass, field, replace
 from clrecon.system.records import Gate, none_of, unmeasured
-from clrecon.system.text import join_names
+from clrecon.system.text import count_of, join_names
 
 LOCALIZERS = 3
 """So many numbers before the first slice may be those of localizers in a series of their own."""
@@ -385,7 +385,7 @@ class Series:
         texts = [image.problem for image in self.others]
         problems = texts[:PROBLEMS_SHOWN]
         if len(texts) > PROBLEMS_SHOWN:
-            problems.append(f"and {len(texts) - PROBLEMS_SHOWN} more files with a problem")
+            problems.append(f"and {count_of(len(texts) - PROBLEMS_SHOWN, 'more file')} with a problem")
         if self.kind == "localizer":
             problems.append("localizer images, not a stack")
         if self.corrupt:

@@ -302,7 +302,7 @@ def measure_stack(headers: Sequence[SliceHeader], *, allow_gaps: bool = False) -
     affine: Float64Array | None = None
     line, holes = Line(), Holes()
     if len(slices) == 1:
-        problems.append("a single slice cannot make a surface")
+        problems.append("a single slice cannot make a volume: it has no distance to a next one")
     else:
         line, holes = measure_line(positions, distances), find_holes(distances)
         rounding = find_rounding(slices, distances, normal, line.tolerance_mm or 0.0)
