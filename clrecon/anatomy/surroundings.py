@@ -151,7 +151,7 @@ LEFT_OUT = "left_out"
 """Entry of the report of a volume with voxels that are left out."""
 
 LEFT_OUT_SKIN_MM = 3.0
-"""The region left out reaches at least this far below the skin, because values there are blurred with the air."""
+"""The region left out around a body reaches at least this far below the skin: values there are blurred with air."""
 
 LEAST_ROOM = 2.0
 """The value of what is left out lies so many times the range of the others above them: of a voxel beside it at most a

@@ -40,7 +40,7 @@ are:
 | T-MC | marching cubes over every cell; neighbouring cells share their vertices |
 | T-MC, soup | T-MC in NumPy, with separate triangles in every cell that are welded afterwards |
 | VTK MC, VTK FE | vtkMarchingCubes and vtkFlyingEdges3D |
-| I-MC | marching cubes only in cells that are connected to seed points |
+| I-MC | marching cubes only in cells that are connected to seed points; here with automatic seeds |
 | I-MC, golden | I-MC with each vertex at the golden section of its edge |
 | G-MC | T-MC, then decimation by quadric error, without an error bound |
 | S-MC | T-MC, then decimation within an error bound; the topology is preserved |"""
