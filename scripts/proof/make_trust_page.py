@@ -67,11 +67,11 @@ def errors_of_rule(phantoms: Sequence[dict[str, Any]], rule: str) -> tuple[float
 
 
 def count_wrong(table: str) -> dict[str, tuple[int, int, int]]:
-    """Return cases, silent faults (bold) and refusals by reader, of a table of files by readers."""
+    """Return cases, silent faults (bold) and refusals by reader, of a table; empty: a file that was not written."""
     lines = [line[2:-2].split(" | ") for line in table.splitlines()]
     counts = {}
     for column, reader in enumerate(lines[0][1:], start=1):
-        tried = [cells[column] for cells in lines[2:] if cells[column] not in ("-", "n/a")]
+        tried = [cells[column] for cells in lines[2:] if cells[column] not in ("", "-", "n/a")]
         refused = sum(cell.startswith(("R", "refused", "crash")) for cell in tried)
         counts[reader] = len(tried), sum("**" in cell for cell in tried), refused
     return counts

@@ -15,7 +15,8 @@ TABLE = """\
 |---|---|---|
 | a | 0 W | **2.6 S** |
 | b | R; --phase 1: 0 W | crash (ValueError) |
-| c | 0 | - |"""
+| c | 0 | - |
+| d | R |  |"""
 
 
 @pytest.mark.parametrize("name", make_trust_page.make_tables())
@@ -26,7 +27,7 @@ def test_page_of_trust_has_the_table_of_the_records(name: str) -> None:
 
 @pytest.mark.parametrize(
     ("reader", "cases", "silent_faults", "refusals"),
-    [("clrecon", 3, 0, 1), ("other", 2, 1, 1)],  # the cell "-" is no case, and a crash is a refusal
+    [("clrecon", 4, 0, 2), ("other", 2, 1, 1)],  # "-" and empty cells are no cases, and a crash is a refusal
 )
 def test_cases_silent_faults_and_refusals_are_counted_by_reader(
     reader: str, cases: int, silent_faults: int, refusals: int
