@@ -48,8 +48,8 @@ def test_misread_and_refused_series_of_the_paper_are_those_of_the_page_of_calibr
     others = [wrong for _, wrong, _ in readers.values()]
     text = " ".join(BODY.split())
     assert f"On {cases} series" in text
-    assert f"between {min(others)} and {max(others)}" in text
-    assert f"misplaces {'none' if wrong == 0 else wrong} and refuses {refused}" in text
+    assert f"for {min(others)} to {max(others)} series" in text
+    assert f"does so for {'none' if wrong == 0 else wrong} and refuses {refused}," in text
 
 
 def test_figure_is_drawn_from_the_records(tmp_path: Path) -> None:
