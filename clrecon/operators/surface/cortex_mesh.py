@@ -53,6 +53,10 @@ _THINNEST_BLURS, EDGE_SHARE = 0.2, 0.6
 """A wall thinner than so many blurs, before something of less than this share of the cortex' HU, is an edge without a
 wall: a vessel, an organ, marrow.  Of true walls 1 to 3 % are as thin."""
 
+_SOLID_SHARE = 0.85
+"""Of bone that has this share of its cortex' HU behind it nothing shows where the cortex ends: it is as thick as the
+profile is deep, at least.  Marrow of balls had up to 0.7, bone without marrow 0.87 to 1.05."""
+
 _ACROSS, _HIDDEN_BLURS = 1.25, 0.3
 """Where a profile is blurred by more than so often what slices are within themselves, a wall thinner than so many of
 these blurs is badly fitted: thick slices hide where within them it lies."""
@@ -93,7 +97,7 @@ class CortexFit:
     states: uint8. Places in `_STATES`; all values below are those of the fit, whatever the state.
     hidden: bool. Badly fitted because thick slices hide the wall.
     shift_mm: From the vertex along its normal, outwards positive.
-    thickness_mm: Of the wall; at most the length of a profile, which stands for solid bone.
+    thickness_mm: Of the wall; solid bone has at least the depth of a profile.
     error_mm: Standard error of the shift.
     spread_mm: That error without what coarse voxels add, by which neighbours are weighed.
     room_mm: From the vertex outwards to the next wall, or to the end of the profile.
@@ -155,7 +159,9 @@ def fit_walls(
             hidden = (blurs > _ACROSS * known.blur_mm) & (walls.thickness_mm < _HIDDEN_BLURS * blurs)
             fit.states[rows] = judge_walls(walls, known, sampler.scale, hidden)
             fit.hidden[rows] = hidden & (fit.states[rows] == _BADLY_FITTED)
-            fit.shift_mm[rows], fit.thickness_mm[rows] = walls.shift_mm, walls.thickness_mm
+            is_solid, depth_mm = walls.inner_hu > _SOLID_SHARE * walls.cortex_hu, np.float32(-sampler.scale.first_mm)
+            fit.thickness_mm[rows] = np.maximum(walls.thickness_mm, np.where(is_solid, depth_mm, np.float32(0.0)))
+            fit.shift_mm[rows] = walls.shift_mm
             fit.room_mm[rows] = walls.room_mm
             fit.spread_mm[rows] = standard_errors(walls, known)
             steps = sampler.frame.steps_along(normals[rows], frames[1])
@@ -362,8 +368,8 @@ def fit_cortex(
     Mesh
         ``values["thickness_mm"]`` and ``values["error_mm"]`` have the thickness of the wall and the standard error of
         its place at each vertex, NaN where none was fitted.  Thicknesses below the blur say "thinner than that"; from
-        half of the profile on they stand for solid bone.  ``report["cortex"]`` says what was measured and counts the
-        vertices.
+        the depth of the profile on, 3.5 mm at voxels of 1 mm3, they stand for solid bone.  ``report["cortex"]`` says
+        what was measured and counts the vertices.
 
     Raises
     ------

@@ -83,6 +83,13 @@ def test_fitted_shell_has_its_thickness_to_a_third_of_a_voxel(fitted_shell):
     assert np.median(fit.thickness_mm[rows]) == pytest.approx(thickness, abs=0.35)  # mm; measured 0.06
 
 
+def test_bone_without_marrow_is_as_thick_as_its_profiles_are_deep(device):
+    """Nothing in the profiles of a solid ball shows where its cortex ends: the fit alone said 0.1 to 5 mm."""
+    _, fit = fit_surface(hollow_ball(thickness=OUTER_RADIUS), device)
+    deep_mm = 3.5  # at voxels of 1 mm
+    assert (fit.thickness_mm[fit.states == FITTED] >= deep_mm).mean() > 0.95  # measured 0.998; 0.23 by the fit alone
+
+
 def test_errors_of_a_fitted_shell_hold_nine_tenths_of_its_distances_from_the_truth(fitted_shell):
     """A standard error of 1.96 would hold 95 % of a normal distribution."""
     _, mesh, fit = fitted_shell
