@@ -19,16 +19,21 @@ _UNUSED = ("requests", "PIL")
 
 
 def hide_unused() -> None:
-    """Hide modules from pydicom by None in `sys.modules`, in a process of our own.
-
-    `clrecon.rendering.pictures.pillow` makes Pillow available again.
-    """
+    """Hide modules from pydicom by None in `sys.modules`, in a process of our own, until `show_unused`."""
     for name in _UNUSED:
         sys.modules.setdefault(name, None)  # type: ignore[arg-type]
 
 
+def show_unused() -> None:
+    """Let the modules be imported that `hide_unused` hides: other packages than pydicom need them."""
+    for name in _UNUSED:
+        if sys.modules.get(name, name) is None:
+            del sys.modules[name]
+
+
 def import_package(module: str, subject: str, package: str | None = None) -> Any:
     """Import a module; `subject` needs it, for the message, and `package` is its name when it is installed."""
+    show_unused()
     try:
         return import_module(module)
     except ImportError as error:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import shutil
 import signal
+import subprocess
+import sys
 import warnings
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -129,10 +131,15 @@ def test_temporary_folder_is_for_its_owner_alone_and_removed_with_its_files(tmp_
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(("name", "fact"), [("a", "extension"), ("a.plx", ".plx"), (".ply", "extension")])
+@pytest.mark.parametrize(("name", "fact"), [("a", "extension"), ("a.plx", ".plx")])
 def test_missing_or_unknown_extension_is_refused_with_the_known_ones(name: str, fact: str) -> None:
     with refused(UsageError, fact, ".ply", ".stl"):
         find_extension(name, (".ply", ".stl"), "mesh")
+
+
+def test_name_that_is_only_an_extension_is_refused_with_it() -> None:
+    with refused(UsageError, "only", ".ply"):
+        find_extension(".ply", (".ply", ".stl"), "mesh")
 
 
 def test_extension_in_capitals_is_found() -> None:
@@ -233,3 +240,15 @@ def test_more_arguments_than_fields_are_refused_with_the_class() -> None:
 def test_field_given_twice_is_refused_with_the_class() -> None:
     with refused(TypeError, "Few", "first"):
         Few(1, first=1)  # type: ignore[misc]
+
+
+def test_package_that_needs_pillow_is_imported_where_the_command_line_hides_it(tmp_path: Path) -> None:
+    """As matplotlib does, with which ``clrecon compare`` draws."""
+    (tmp_path / "draws.py").write_text("from PIL import Image\n", encoding="utf-8")
+    code = """
+from clrecon.system.packages import hide_unused, import_package
+hide_unused()
+print(import_package("draws", "a page").Image.__name__)
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
+    assert done.stdout == "PIL.Image\n", done.stderr

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 from typing import TYPE_CHECKING
 
 from clrecon.errors import UsageError
+from clrecon.system.packages import show_unused
 
 if TYPE_CHECKING:
     from PIL import ImageFont
@@ -13,8 +13,7 @@ if TYPE_CHECKING:
 
 def load_pillow() -> None:
     """Make ``from PIL import ...`` work from here on, where the command line hides Pillow from pydicom."""
-    if sys.modules.get("PIL", load_pillow) is None:
-        del sys.modules["PIL"]
+    show_unused()
     try:
         import PIL.Image  # noqa: F401
     except ImportError as error:
