@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.exchange.content import certificate_lines
-from clrecon.exchange.formats import FORMATS, stage_content
+from clrecon.exchange.formats import FORMATS, MESH_INPUTS, stage_content
 from clrecon.jobs.outputs import MeshFiles
 from clrecon.jobs.run import JobReport, Run
 from clrecon.jobs.settings import FITTED_FROM_HU, DistanceSettings
@@ -23,7 +23,7 @@ from clrecon.mesh.compare.distances import SAMPLES, DistanceSummary
 from clrecon.mesh.compare.signed import Ruler, SideDistance, compare_sides
 from clrecon.mesh.mesh_reader import read_mesh
 from clrecon.mesh.quality import survey_surface
-from clrecon.system.arguments import Space
+from clrecon.system.arguments import Space, name_parameter
 from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.pieces import side_by_side
 from clrecon.system.text import escape_text, format_digits
@@ -84,6 +84,10 @@ def measure_meshes(
             load_pillow()
             check_image_path(files.picture)
         run.check(files.named("the coloured mesh"), mesh, reference)
+        if settings.surface is not None and os.fspath(reference).lower().endswith(MESH_INPUTS):
+            raise UsageError(
+                f"{name_parameter('surface', settings.surface)} needs a scan as B: with a mesh leave it out"
+            )
         device = take_device(settings.device) if files.picture is not None or settings.surface is not None else None
         run.progress("read", 0, 0)
         read_own = partial(read_side, mesh, settings.mesh_space)

@@ -234,6 +234,7 @@ def test_picture_of_distances_is_red_at_the_ends_alone_with_its_scale_beside(
         (["B", "--samples", "0"], 3, "samples"),
         (["B", "--mesh-space", "xyz"], 3, "xyz"),
         (["B", "--view", "sideways"], 3, "sideways"),
+        (["B", "--surface", "cortex"], 3, "scan"),
         (["x.off"], 3, ".stl"),
     ],
 )
