@@ -91,7 +91,7 @@ class MeshLook(Style, Lit):
         name = f"{self.color_by}_mm"
         known = np.abs(values[name][np.isfinite(values[name])]) if name in values else np.zeros(0)
         if not len(known):
-            whose = "coloured by distance, as PLY," if self.color_by == "distance" else "of the cortex, as PLY or VTP,"
+            whose = "coloured by distance (PLY)" if self.color_by == "distance" else "fitted to the cortex (PLY, VTP)"
             raise UsageError(f"the mesh has no {name} at its vertices: one {whose} has them")
         limit = round_up(max(float(np.percentile(known, 95.0)), _LEAST_LIMIT_MM))
         return ColorScale(limit, bool((values[name] < 0.0).any())), values[name]
