@@ -12,6 +12,7 @@ import re
 import socket
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import CancelledError
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from itertools import islice
 from time import monotonic
@@ -129,9 +130,12 @@ class Cluster:
     def _result_of(self, future: Any) -> Any:
         if future.status == "cancelled":
             raise self._lost()
-        error = future.exception() if future.status == "error" else None
-        if error is None:
-            return future.result()
+        try:
+            error = future.exception() if future.status == "error" else None
+            if error is None:
+                return future.result()
+        except (OSError, CancelledError) as lost:  # a task that ended without an error: its result did not arrive
+            raise self._lost() from lost
         if type(error).__name__ == "KilledWorker":
             return Died("its worker died, and so did others that got it: out of memory, or ended by somebody")
         if isinstance(error, ClreconError):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from concurrent.futures import CancelledError
 from typing import Any
 
 import pytest
@@ -21,8 +22,10 @@ class KilledWorker(Exception):
 
 
 class FakeFuture:
-    def __init__(self, work: Callable[[], Any] | None):
-        self.status, self.error, self.value = "finished", None, None
+    """fault: Raised in place of handing the result over."""
+
+    def __init__(self, work: Callable[[], Any] | None, fault: Exception | None = None):
+        self.status, self.error, self.value, self.fault = "finished", None, None, fault
         if work is None:
             self.status = "cancelled"
             return
@@ -35,6 +38,8 @@ class FakeFuture:
         return self.error
 
     def result(self) -> Any:
+        if self.fault is not None:
+            raise self.fault
         return self.value
 
 
@@ -44,7 +49,8 @@ class FakeClient:
     The task `killer` kills its worker, and Dask blames each task that is submitted at that time.
     """
 
-    def __init__(self, is_lost: bool = False):
+    def __init__(self, is_lost: bool = False, fault: Exception | None = None):
+        self.fault = fault
         self.is_lost, self.running, self.most, self.cancelled = is_lost, {}, 0, []
         self.submitted: Counter[str] = Counter()
 
@@ -53,7 +59,7 @@ class FakeClient:
 
     def submit(self, run: Callable[..., Any], version: str, function: Any, item: str, *shared: Any, key: str) -> Any:
         self.submitted[item] += 1
-        future = FakeFuture(None if self.is_lost else lambda: run(version, function, item, *shared))
+        future = FakeFuture(None if self.is_lost else lambda: run(version, function, item, *shared), self.fault)
         client = self
 
         class Submitted:
@@ -119,6 +125,14 @@ def test_worker_without_a_package_is_refused_with_the_scheduler_and_the_version_
 def test_lost_scheduler_is_an_error_with_its_address() -> None:
     with refused(UnreachableError, "tcp://far:8786"):
         run_all(FakeClient(is_lost=True), "a b c d e f")
+
+
+@pytest.mark.parametrize(
+    "fault", [ConnectionResetError("reset by peer"), CancelledError("lost dependencies")], ids=repr
+)
+def test_scheduler_lost_while_a_result_is_fetched_is_an_error_with_its_address(fault: Exception) -> None:
+    with refused(UnreachableError, "tcp://far:8786"):
+        run_all(FakeClient(fault=fault), "a b c d e f")
 
 
 @pytest.mark.parametrize("address", ["host:8786", "tcp://host", "http://host:8786", "8786", "Local"])
