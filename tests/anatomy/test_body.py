@@ -159,9 +159,11 @@ def test_a_scan_without_anything_14_mm_thick_is_refused():
 
 
 # --- field of view ---
+HALF_OF_THE_HEIGHT_MM = SHAPE[1] * SPACING[1] / 2  # of a slice that is wider than high
+
 circles = pytest.mark.parametrize(
     ("radius_mm", "expected_mm"),
-    [(None, 170 * 1.8 / 2), (80.0, 80.0), (400.0, 400.0)],
+    [(None, HALF_OF_THE_HEIGHT_MM), (80.0, 80.0), (400.0, 400.0)],
     ids=["circle of the scan", "80 mm", "beyond the slice"],
 )
 

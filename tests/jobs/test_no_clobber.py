@@ -220,7 +220,7 @@ def test_save_from_python_writes_a_new_file_with_no_clobber_as_without_it(name: 
 
 
 @pytest.mark.fault_row(63)
-def test_numbered_file_is_refused_with_no_clobber_alone(tmp_path: Path) -> None:
+def test_output_with_numbered_files_is_refused_only_with_no_clobber(tmp_path: Path) -> None:
     (tmp_path / "bone_001.stl").write_bytes(b"")
 
     refuse_numbered(tmp_path / "bone.stl")

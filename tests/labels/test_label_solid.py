@@ -69,14 +69,14 @@ def cube_of_label_7():
 
 def test_voxels_whose_neighbours_all_carry_the_label_are_filled_and_counted():
     labels = cube_of_label_7()
-    assert fill_solid(np.zeros_like(labels), labels, 7, INNER_BOX, True) == 3**3  # all but the outermost voxels
+    assert fill_solid(np.zeros_like(labels), labels, 7, INNER_BOX, closed=True) == 3**3  # all but the outermost voxels
 
 
 def test_hole_within_a_label_is_filled_and_counted():
     labels = cube_of_label_7()
     labels[4, 4, 4] = 0
     solid = labels.copy()
-    assert fill_solid(solid, labels, 7, INNER_BOX, True) == 1
+    assert fill_solid(solid, labels, 7, INNER_BOX, closed=True) == 1
     assert solid[4, 4, 4] == 7
 
 
@@ -84,7 +84,7 @@ def test_voxel_of_another_label_within_a_label_is_not_filled():
     labels = cube_of_label_7()
     labels[4, 4, 4] = 3
     solid = np.where(labels == 7, labels, 0)
-    assert fill_solid(solid, labels, 7, INNER_BOX, True) == 0
+    assert fill_solid(solid, labels, 7, INNER_BOX, closed=True) == 0
     assert solid[4, 4, 4] == 0
 
 
@@ -92,7 +92,7 @@ def test_voxel_that_another_solid_label_has_filled_keeps_that_label():
     labels = cube_of_label_7()
     solid = np.zeros_like(labels)
     solid[4, 4, 4] = 5
-    assert fill_solid(solid, labels, 7, INNER_BOX, True) == 3**3 - 1
+    assert fill_solid(solid, labels, 7, INNER_BOX, closed=True) == 3**3 - 1
     assert solid[4, 4, 4] == 5
 
 
@@ -101,4 +101,4 @@ def test_hole_with_a_way_out_of_the_label_is_not_filled(axis):
     labels = cube_of_label_7()
     np.moveaxis(labels, axis, 0)[2:5, 4, 4] = 0  # from a face of the cube to its middle
     solid = labels.copy()
-    assert fill_solid(solid, labels, 7, INNER_BOX, True) == 0
+    assert fill_solid(solid, labels, 7, INNER_BOX, closed=True) == 0

@@ -31,8 +31,9 @@ def test_new_mesh_counts_its_vertices_and_triangles_and_has_an_empty_report():
     assert (mesh.vertex_count, mesh.triangle_count, mesh.report) == (3, 1, {})
 
 
-def test_lists_and_other_integers_become_float32_vertices_and_contiguous_uint32_triangles():
-    reversed_columns = np.array([[0, 1, 2]], np.int64)[:, ::-1]
+@pytest.mark.parametrize("integers", [np.int64, np.uint32])
+def test_lists_and_integers_become_float32_vertices_and_contiguous_uint32_triangles(integers):
+    reversed_columns = np.array([[0, 1, 2]], integers)[:, ::-1]  # not contiguous
     mesh = Mesh([[0, 0, 0], [1, 0, 0], [0, 2.5, 0]], reversed_columns)
     assert (mesh.vertices.dtype, mesh.triangles.dtype) == (np.float32, np.uint32)
     assert mesh.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [0, 2.5, 0]]

@@ -464,9 +464,10 @@ def test_a_voxel_of_a_part_has_its_place_ahead_aside_and_along_the_canal(
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_side_wall_is_looked_for_from_the_core_to_behind_it(sign: int) -> None:
     """Each HU is its own place aside, so that the highest says where it was found; nothing known has -200 HU."""
-    values = np.tile(np.float32(ASIDE_MM), (2, 1, 1))
-    values[1, :, np.abs(ASIDE_MM) < 10.0] = np.nan
-    walls_mm = np.array([15.0, 9.0 - WALL_MARGIN_MM])
+    values = np.tile(np.float32(ASIDE_MM), (2, 1, 1))  # 2 places along the canal, 1 ahead, and all aside
+    known_from_mm = 10.0
+    values[1, :, np.abs(ASIDE_MM) < known_from_mm] = np.nan
+    walls_mm = np.array([15.0, known_from_mm - 1.0 - WALL_MARGIN_MM])  # the second search ends 1 mm before the known
     innermost_on_the_right, outermost_on_the_left = -CORE_ASIDE_MM, 15.0 + WALL_MARGIN_MM
     highest = _highest(values, sign, walls_mm)[:, 0]
     assert highest.tolist() == [innermost_on_the_right if sign < 0 else outermost_on_the_left, -200.0]

@@ -306,7 +306,7 @@ def record_exits():
 
 
 @pytest.mark.parametrize(("lifeline", "is_orphan"), [(-1, True), (0, False), (3, False)])
-def test_decoder_process_without_a_lifeline_is_limited_as_an_orphan_and_answers_with_pixels(
+def test_decoder_process_answers_with_pixels_and_is_limited_as_an_orphan_only_without_a_lifeline(
     monkeypatch, lifeline, is_orphan
 ):
     """The main function in this process, with what changes the process itself put aside."""
@@ -328,6 +328,8 @@ def test_decoder_process_without_a_lifeline_is_limited_as_an_orphan_and_answers_
     monkeypatch.setattr(sys, "argv", ["decoder_process.py", str(lifeline)])
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(source))
     decoder_process.main()
-    assert limits == [1, (4.0, is_orphan)] and alarms == [0]
-    head = struct.pack(decoder_process.REPLY, decoder_process.READY, 0)
-    assert sink.getvalue() == head + struct.pack(decoder_process.REPLY, decoder_process.DONE, 216) + PIXELS.tobytes()
+    assert limits == [1, (4.0, is_orphan)]
+    assert alarms == [0]  # none runs while it waits for the next frame
+    ready = struct.pack(decoder_process.REPLY, decoder_process.READY, 0)
+    done = struct.pack(decoder_process.REPLY, decoder_process.DONE, PIXELS.nbytes)
+    assert sink.getvalue() == ready + done + PIXELS.tobytes()

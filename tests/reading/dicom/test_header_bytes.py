@@ -417,7 +417,8 @@ def test_all_elements_are_kept_where_none_are_named():
 
 
 def test_only_the_named_elements_are_kept():
-    parsed = parse_three_elements((0x00080005, 0x00180060))
+    not_in_the_file = 0x00080005
+    parsed = parse_three_elements((not_in_the_file, 0x00180060))
     assert (parsed.values, parsed.vrs) == ({0x00180060: b"120 "}, {0x00180060: "DS"})
 
 

@@ -168,7 +168,7 @@ def test_element_that_changes_along_one_volume_does_not_part_it(tmp_path, keywor
 
 # --- what may alternate within one volume: the pixels decide ---
 def moved_bodies(moved):
-    """A widening_body that is the same in all slices, moved along its rows in one of the volumes, and noise."""
+    """A body that widens from slice to slice, moved along its rows in the second volume, and noise."""
     y, x = np.mgrid[:64, :64]
 
     def stored(number, k):
@@ -304,7 +304,7 @@ def test_values_by_turns_in_a_part_alternate_where_its_slices_lie_closer():
 
 # --- the likeness of slices ---
 def widening_body(slices, seed=1, noise=20.0):
-    """HU of a widening_body that widens, with bone and noise."""
+    """HU of a body that widens, with bone and noise."""
     y, x = np.mgrid[:128, :128] - 63.5
     radius = np.hypot(x, y)
     hu = np.stack([np.where(radius < 40 + 0.4 * k, 40.0, -1000.0) for k in range(slices)])

@@ -299,8 +299,10 @@ def test_oblique_clip_of_a_mesh_cuts_its_triangles_at_the_plane(open_model_and_p
     (mesh,) = painter.mesh_of_shown(model.state)
     (*normal, offset) = model.state.clip.planes[0]
     heights = mesh.vertices @ normal - offset
-    assert heights.min() == pytest.approx(0.0, abs=1e-4) and mesh.triangle_count > 100  # 1,264 of 2,208
-    assert mesh.area == pytest.approx(0.5 * scenes.make_mesh().area, rel=0.02)
+    assert mesh.triangle_count > 100  # 1,264 of 2,208
+    assert heights.min() == pytest.approx(0.0, abs=1e-4)  # mm; -3e-6 was measured, as vertices are rounded to float32
+    half_of_the_ball = scenes.make_mesh().area / 2  # a new plane goes through the middle
+    assert mesh.area == pytest.approx(half_of_the_ball, rel=1e-4)  # 2e-7 was measured
 
 
 def test_large_mesh_is_drawn_with_fewer_triangles_while_it_moves(open_model_and_painter):

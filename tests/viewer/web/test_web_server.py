@@ -448,6 +448,9 @@ def test_saved_files_that_are_not_fetched_are_removed_with_the_server(views: Vie
     assert [path.parent.exists() for path in written] == [False]
 
 
+ISO_AT_FIRST = 200.0  # HU, of a view that Views open
+
+
 def read_iso_of(served: WebServer, tab: str, change: float | None = None) -> float:
     """Connect as a tab, change the iso value if asked to, and return it as the tab leaves."""
 
@@ -473,7 +476,7 @@ def test_a_tab_that_loads_the_page_again_goes_on_with_its_view(served: WebServer
 def test_another_tab_begins_anew(served: WebServer, tab: str) -> None:
     read_iso_of(served, "one", change=120.0)
 
-    assert read_iso_of(served, tab) == 200.0
+    assert read_iso_of(served, tab) == ISO_AT_FIRST
 
 
 def test_views_of_as_many_tabs_are_kept_as_browsers_may_be_open(served: WebServer) -> None:
@@ -481,7 +484,7 @@ def test_views_of_as_many_tabs_are_kept_as_browsers_may_be_open(served: WebServe
         read_iso_of(served, f"tab {number}", change=120.0 + number)
 
     assert read_iso_of(served, "tab 1") == 121.0
-    assert read_iso_of(served, "tab 0") == 200.0
+    assert read_iso_of(served, "tab 0") == ISO_AT_FIRST
 
 
 # Ends
