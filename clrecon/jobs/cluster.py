@@ -12,7 +12,6 @@ import re
 import socket
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import CancelledError
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from itertools import islice
 from time import monotonic
@@ -128,6 +127,8 @@ class Cluster:
                 self._client.cancel(list(running))
 
     def _result_of(self, future: Any) -> Any:
+        from concurrent.futures import CancelledError
+
         if future.status == "cancelled":
             raise self._lost()
         try:

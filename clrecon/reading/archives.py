@@ -199,8 +199,14 @@ class _Zip:
     def __enter__(self) -> _Zip:
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        from zipfile import BadZipFile
+        from zlib import error as UnpackingError
+
         self._zip.close()
+        if self._password is not None and isinstance(error, UnpackingError | BadZipFile | EOFError):
+            # One wrong password of 256 passes the check of zip, which is a byte long.
+            raise UsageError(f"the password of {self._name} in {PASSWORD_VARIABLE} is wrong, or the file is damaged")
 
     def find_entries(self) -> Iterator[_Entry]:
         for entry in self._zip.infolist():

@@ -329,6 +329,28 @@ def test_encrypted_archive_is_refused_and_the_variable_named(
         read_volume(encrypted)
 
 
+def test_wrong_password_that_passes_the_check_byte_is_refused_and_the_variable_named(
+    encrypted: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(PASSWORD_VARIABLE, find_password_that_passes(encrypted))
+
+    with refused(UsageError, "scan.zip", PASSWORD_VARIABLE):
+        read_volume(encrypted)
+
+
+def find_password_that_passes(path: Path) -> str:
+    """Return a wrong password which the check of zip lets pass: it is a byte long."""
+    with zipfile.ZipFile(path) as archive:
+        name = next(entry.filename for entry in archive.infolist() if not entry.is_dir())
+        for number in range(10_000):
+            try:
+                archive.open(name, pwd=str(number).encode()).close()
+            except RuntimeError:
+                continue
+            return str(number)
+    raise AssertionError("no password passes")
+
+
 def test_modules_for_archives_are_not_loaded_for_a_folder(scan: Path) -> None:
     code = "import sys, clrecon; clrecon.read_volume(sys.argv[1]); print({'zipfile', 'tarfile'} & {*sys.modules})"
 

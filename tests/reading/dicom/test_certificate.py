@@ -56,7 +56,9 @@ def test_certificate_of_a_listing_that_reads_pixels_is_the_report_of_the_volume_
 def test_certificate_has_the_gates_of_the_contract(tmp_path):
     write_series(tmp_path)
     contract = (Path(__file__).resolve().parents[3] / "docs" / "contract.md").read_text(encoding="utf-8")
-    table = contract.split("table gives what passes each gate:\n\n| gate | bound |\n|---|---|\n")[1].split("\n\n")[0]
+    table = contract.split("The table gives what a series must meet:\n\n| gate | bound |\n|---|---|\n")[1].split(
+        "\n\n"
+    )[0]
     named = {name for row in table.splitlines() for name in re.findall(r"`(\w+)`", row.split("|")[1])}
 
     assert {gate["name"] for gate in read_volume(tmp_path).report["gates"]} == named

@@ -269,13 +269,13 @@ def test_ct_beside_a_larger_series_of_mr_is_read_and_the_mr_refused(tmp_path):
 def test_two_series_of_one_slice_are_refused(tmp_path):
     for number in (1, 2):
         write_series(tmp_path, Plan(series=number, shape=(1, 5, 6), name=f"{number}-{{}}".format))
-    with refused(RefusedInputError, 2, "surface"):
+    with refused(RefusedInputError, 2, "slice"):
         read_volume(tmp_path)
 
 
-def test_single_slice_is_refused_as_it_makes_no_surface(tmp_path):
+def test_single_slice_is_refused_as_it_makes_no_volume(tmp_path):
     write_series(tmp_path, Plan(shape=(1, 5, 6)))
-    with refused(RefusedInputError, "surface"):
+    with refused(RefusedInputError, "slice"):
         read_volume(tmp_path / "slice000.dcm")
 
 
@@ -447,8 +447,8 @@ def test_dicomdir_is_refused_as_it_only_lists_files(dicomdir_tree):
         read_volume(dicomdir_tree / "DICOMDIR")
 
 
-def test_single_slice_of_another_scanner_is_refused_as_it_makes_no_surface():
-    with refused(RefusedInputError, "surface"):
+def test_single_slice_of_another_scanner_is_refused_as_it_makes_no_volume():
+    with refused(RefusedInputError, "slice"):
         read_volume(get_testdata_file("CT_small.dcm"))
 
 

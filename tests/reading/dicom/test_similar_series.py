@@ -74,7 +74,7 @@ def test_series_of_similar_size_in_different_directions_is_read_by_its_number(tm
 
 
 def test_one_file_of_a_series_is_refused_with_the_advice_to_name_the_folder(two_series):
-    with refused(RefusedInputError, "surface", "names"):
+    with refused(RefusedInputError, "slice", "names"):
         read_volume(two_series / "a0")
 
 
