@@ -191,7 +191,12 @@ class ViewSession(Closing):
         )
 
     def draw_modes(self, then: Callable[[str, Rendering], None]) -> None:
-        """Draw a small picture in each mode in the background; `then` gets it with the name of the mode."""
+        """Draw a small picture in each mode in the background; `then` gets it with the name of the mode.
+
+        None of a scan in slabs: each would take it to the device again, and hold up the pictures that are wanted.
+        """
+        if self._timing.get("slabs", 1) > 1:
+            return
         with self._lock:
             states = {name: self.model.state_in(name) for name in self.model.modes}
 

@@ -16,7 +16,7 @@ class Scene:
     affine: Index (i, j, k) to LPS mm, its steps at right angles.
     points: HU, red, green, blue and opacity of the transfer function; linear between them, constant beyond.
     unit_distance, ray_step: mm.
-    ambient, diffuse, specular, specular_power: Phong's constants, light at the camera.
+    ambient, diffuse, specular, specular_power: Phong's constants, with a headlight.
     position, focal_point, up: Camera, LPS mm.
     view_angle, parallel_scale: One of the two is given; meanings as in VTK.
     width, height: Pixels.

@@ -22,7 +22,7 @@ SIZE = (100, 100)
 
 
 def picture_of_wall(left: int, right: int, mm: float) -> Rendering:
-    """A picture of a picture_of_wall over some columns, so far from the eye."""
+    """A picture of a wall over some columns, this far from the eye."""
     depth = np.full(SIZE[::-1], np.nan, np.float32)
     depth[:, left:right] = mm
     image = np.zeros((*SIZE[::-1], 4), np.uint8)

@@ -414,19 +414,6 @@ def test_mesh_of_more_than_two_million_triangles_is_warned_of_as_slow():
 
 
 @pytest.mark.opencl
-def test_scan_that_is_drawn_in_slabs_is_warned_of_as_slow(open_session):
-    view = open_session(scenes.make_scan(), memory=80_000)
-    pictures: list[Any] = []
-
-    view.picture((24, 20), False, pictures.append)
-
-    assert view.wait(PATIENCE)
-    assert len(pictures) == 1
-    assert view.facts()["error"] is None
-    assert any("in slabs, which is slow" in text for text in view.facts()["warnings"])
-
-
-@pytest.mark.opencl
 def test_picture_too_large_for_the_allowed_memory_is_an_error(open_session):
     view = open_session(scenes.make_scan(), memory=80_000)
     pictures: list[Any] = []
