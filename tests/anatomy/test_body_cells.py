@@ -65,12 +65,12 @@ def test_each_layer_of_cells_is_told_once():
     assert sum(part.stop - part.start for part in parts) == len(cells.mean)
 
 
-@pytest.mark.parametrize(("mm", "n"), [(2.0 / 41, 41), (1.0 / 32, 64)])
-def test_counts_of_cells_hold_every_voxel_of_micro_ct(mm, n):
-    """From 41 voxels a side on, 16 bits do not hold the number of voxels of a cell."""
+@pytest.mark.parametrize(("voxel_mm", "n"), [(2.0 / 41, 41), (1.0 / 32, 64)])
+def test_counts_of_cells_hold_every_voxel_of_micro_ct(voxel_mm, n):
+    """From n = 41 voxels a side on, 16 bits do not hold the number of voxels of a cell; a second one has 3 columns."""
     voxels = np.full((n, n, n + 3), 601, np.int16)
     voxels[0, 0, 0] = 600  # dense, above 300 HU, but not hard, above 600 HU
-    cells = measure_cells(Volume(voxels, np.diag((mm, mm, mm, 1.0))))
+    cells = measure_cells(Volume(voxels, np.diag((voxel_mm, voxel_mm, voxel_mm, 1.0))))
     assert cells.step == (n, n, n)
     assert cells.dense.ravel().tolist() == [n**3, 3 * n * n]
     assert cells.hard.ravel().tolist() == [n**3 - 1, 3 * n * n]
@@ -95,5 +95,5 @@ def test_air_within_a_cell_of_the_border_of_the_scan_is_no_cavity(from_border, i
     tissue[:, 5:8, from_border : from_border + 3] = False
     tissue = np.rot90(tissue, turns, (1, 2))
     hu = np.where(tissue, np.arange(144).reshape(tissue.shape), -1000).astype(np.float32)
-    cavities = _find_cavities(hu, tissue, np.zeros_like(tissue), 2.0)
+    cavities = _find_cavities(hu, tissue, thick=np.zeros_like(tissue), across=2.0)
     assert np.array_equal(cavities, ~tissue & is_cavity)

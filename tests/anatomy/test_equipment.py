@@ -12,14 +12,17 @@ from clrecon.anatomy.body import remove_table
 from clrecon.anatomy.dense_pieces import _is_bar, _measure_sections
 from clrecon.errors import RefusedInputError
 
-CLIP = box((0, 70, 20), (8, 8, 12))
+CLIP = box((0, 70, 20), half=(8, 8, 12))
 
-EQUIPMENT = {
-    "a rail off the table, and a clip": (box((165, 40, 0), (4, 4, 60), 0.04), CLIP),
-    "a thick rail, and a clip": (box((165, 40, 0), (6, 6, 80), 0.04), CLIP),
-    "a rail beside the skin with a clip on it": (box((140, 10, 0), (4, 4, 70)), box((135, 10, 40), (6, 6, 8))),
-    "a bar of 24 ml across within the table": (box((75, 97, 0), (100, 5, 6)), CLIP),
-    "a bar across under a leg": (box((75, 76, 0), (80, 8, 8)), CLIP),
+EQUIPMENT = {  # boxes about a centre (x, y, z), mm, with half of their edges; rails slant along the legs
+    "a rail off the table, and a clip": (box((165, 40, 0), half=(4, 4, 60), slant=0.04), CLIP),
+    "a thick rail, and a clip": (box((165, 40, 0), half=(6, 6, 80), slant=0.04), CLIP),
+    "a rail beside the skin with a clip on it": (
+        box((140, 10, 0), half=(4, 4, 70)),
+        box((135, 10, 40), half=(6, 6, 8)),
+    ),
+    "a bar of 24 ml across within the table": (box((75, 97, 0), half=(100, 5, 6)), CLIP),
+    "a bar across under a leg": (box((75, 76, 0), half=(80, 8, 8)), CLIP),
 }
 
 
@@ -99,7 +102,7 @@ def test_the_straight_bone_of_a_thin_limb_counts_as_bone_and_stays():
 def test_paddles_of_plastic_as_thick_as_a_limb_are_reported_with_their_place_as_kept_without_bone():
     hu, _ = make_legs()
     for side in (-1, 1):
-        hu[box((185 * side, -40, 0), (14, 40, 30))] = PLASTIC_HU
+        hu[box((185 * side, -40, 0), half=(14, 40, 30))] = PLASTIC_HU
     kept = remove_table(as_scan(hu)).report["remove_table"]["kept_without_bone"]
     right, left = (piece["at_mm"] for piece in kept)
     assert right == pytest.approx([-185, -40, 0], abs=2.0)  # less than a voxel
@@ -114,7 +117,7 @@ def test_a_dry_shaft_beside_a_patient_stays_and_counts_as_bone():
     hu[shaft] = 1300
     cleaned = remove_table(as_scan(hu))
     assert (cleaned.voxels > 600)[shaft].all()
-    assert cleaned.report["remove_table"]["bone_voxels"] >= np.count_nonzero(bone) + 0.95 * np.count_nonzero(shaft)
+    assert cleaned.report["remove_table"]["bone_voxels"] >= np.count_nonzero(bone) + np.count_nonzero(shaft)
 
 
 @pytest.mark.parametrize(
@@ -131,12 +134,12 @@ def test_a_dry_shaft_beside_a_patient_stays_and_counts_as_bone():
 def test_a_bar_is_50_mm_long_and_three_times_its_thickness(cells, slice_mm, is_bar):
     """Its length is that between the first and the last middle of cells, of 1.5 mm within slices."""
     hu = np.full(cells, 500, np.float32)
-    assert _is_bar(np.ones(cells, bool), hu, (slice_mm, 1.5, 1.5)) == is_bar
+    assert _is_bar(np.ones(cells, bool), hu, size_mm=(slice_mm, 1.5, 1.5)) == is_bar
 
 
 def test_four_sections_of_an_even_bar_have_the_same_weight_and_middle():
     """40 cells of 1.5 mm with a weight of 3, less a whole one at both ends: four sections of 57 / 4 mm, 9.5 cells."""
     along, across = 1.5 * np.arange(40.0), np.tile([0.5, -2.0], (40, 1))
-    middles, weights = _measure_sections(along, across, np.full(40, 3.0), 1.5)
+    middles, weights = _measure_sections(along, across, weights=np.full(40, 3.0), cell_mm=1.5)
     np.testing.assert_allclose(weights, 3.0 * 9.5, rtol=tolerances.FLOAT64_SHARE)
     np.testing.assert_allclose(middles, across[:4], rtol=tolerances.FLOAT64_SHARE)

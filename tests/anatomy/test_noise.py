@@ -50,5 +50,5 @@ def test_noise_of_a_spine_phantom_is_measured(noise_hu):
 
 def test_noise_of_a_scan_without_soft_tissue_is_refused():
     air = Volume(np.full((3, 60, 60), -1000, np.int16), np.eye(4))
-    with refused(UsageError, 0, 6, 3):
+    with refused(UsageError, 0, 6, 3):  # blocks, voxels a side of a block, slices
         measure_noise(air)

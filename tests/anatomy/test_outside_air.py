@@ -31,11 +31,11 @@ def find_cavities(lungs: bool) -> np.ndarray:
 def patient_in_air(request):
     """The scan, the scan without the air around the patient, and what lies below -400 HU within the patient."""
     lungs, table = request.param
-    hu, patient = make_patient(lungs)
+    hu, patient = make_patient(lungs=lungs)
     if table:
         add_table(hu, patient)
     volume = as_volume(hu)
-    return volume, leave_outside_air(volume, [LEVEL_HU]), find_cavities(lungs) & (volume.voxels < LEVEL_HU)
+    return volume, leave_outside_air(volume, [LEVEL_HU]), find_cavities(lungs=lungs) & (volume.voxels < LEVEL_HU)
 
 
 def test_air_below_the_level_stays_in_cavities_of_the_body_alone(patient_in_air):
@@ -96,7 +96,7 @@ def test_an_airway_that_is_open_to_the_outside_is_cut_at_its_mouth(open_airway):
 
 def test_report_has_about_the_section_of_an_airway_that_was_cut(open_airway):
     opening_mm2 = open_airway.report["outside_air"]["opening_mm2"]
-    assert 0.5 * TUBE_SECTION_MM2 <= opening_mm2 <= 4.0 * TUBE_SECTION_MM2  # the mouth is a curved surface of cells
+    assert TUBE_SECTION_MM2 <= opening_mm2 <= 1.4 * TUBE_SECTION_MM2  # a curved surface of cells: measured 1.16
 
 
 def test_lungs_that_the_field_of_view_cuts_stay_and_the_padding_around_is_left_out():

@@ -25,7 +25,7 @@ from clrecon.geometry import Volume
 pytestmark = pytest.mark.unit
 
 
-def random_cells(shape=(7, 52, 55), border=0) -> SpineCells:
+def random_cells(*, shape=(7, 52, 55), border=0) -> SpineCells:
     """Bone, muscle and air at random, in lumps as large as the filters, with air all around if there is a border."""
     from scipy.ndimage import gaussian_filter
 
@@ -37,6 +37,7 @@ def random_cells(shape=(7, 52, 55), border=0) -> SpineCells:
 
 
 def shift_plainly(field, right, back):
+    """The field (nz, ny, nx) seen from mm to the right and the back of each cell; 0 beyond it."""
     dx, dy = round(right / CELL_MM[0]), round(back / CELL_MM[1])
     moved = np.zeros_like(field)
     for j in range(field.shape[1]):
@@ -149,7 +150,7 @@ def test_cells_are_sure_whose_traits_all_reach_their_bounds_by_the_plain_formula
 @pytest.mark.parametrize(("border", "first"), [(0, (0, 0)), (14, (4, 4))], ids=["no border", "air all around"])
 def test_cells_farther_than_25_mm_from_tissue_are_not_measured(border, first):
     """Ten cells of 2.5 mm are kept around the tissue, on either side."""
-    measured = measure_likeness(random_cells(border=border), lambda part: None)
+    measured = measure_likeness(random_cells(shape=(7, 52, 55), border=border), lambda part: None)
     assert measured.first == first
     assert measured.worth.shape[1:] == (52 - 2 * first[0], 55 - 2 * first[1])
 
@@ -157,13 +158,13 @@ def test_cells_farther_than_25_mm_from_tissue_are_not_measured(border, first):
 @pytest.mark.release
 def test_likeness_is_measured_in_parts_of_four_slices_that_are_told_when_done():
     parts: list[slice] = []
-    measure_likeness(random_cells(), parts.append)
+    measure_likeness(random_cells(shape=(7, 52, 55)), parts.append)
     assert [(part.start, part.stop) for part in parts] == [(0, 4), (4, 7)]
 
 
 def test_some_random_cells_and_not_all_are_sure_by_lower_bounds():
     lower = {"wall": 0.2, "mirror": 0.01, "body": 0.2, "soft": 0.2}
-    sure = measure_likeness(random_cells(), lambda _: None, lower).sure
+    sure = measure_likeness(random_cells(), lambda _: None, bounds=lower).sure
     assert sure.any()
     assert not sure.all()
 
@@ -186,23 +187,25 @@ CORTEX_OF_COLUMN = [30 / 130, 1, 1, 1, 10 / 130, 0]
 
 
 def test_cortex_is_the_highest_within_12_mm_and_ends_with_the_scan(column_of_cells):
-    cortex = [float(grow_cortex(column_of_cells, k, k + 1, 12.0)[0, 0, 0]) for k in range(6)]
+    cortex = [float(grow_cortex(column_of_cells, k, k + 1, height=12.0)[0, 0, 0]) for k in range(6)]
     assert cortex == pytest.approx(CORTEX_OF_COLUMN)
 
 
 def test_cortex_of_all_cells_at_once_is_that_of_each(column_of_cells):
-    assert grow_cortex(column_of_cells, 0, 6, 12.0)[:, 0, 0].tolist() == pytest.approx(CORTEX_OF_COLUMN)
+    assert grow_cortex(column_of_cells, first=0, end=6, height=12.0)[:, 0, 0].tolist() == pytest.approx(
+        CORTEX_OF_COLUMN
+    )
 
 
 def test_cells_beyond_the_scan_are_those_of_its_end(column_of_cells):
-    first_two_and_one_on_each_side = column_of_cells.around(0, 2, 1)
-    last_and_two_on_each_side = column_of_cells.around(5, 6, 2)
+    first_two_and_one_on_each_side = column_of_cells.around(first=0, end=2, reach=1)
+    last_and_two_on_each_side = column_of_cells.around(first=5, end=6, reach=2)
     assert first_two_and_one_on_each_side[:, 0, 0].tolist() == [100, 100, 200, 400]
     assert last_and_two_on_each_side[:, 0, 0].tolist() == [180, 100, 100, 100, 100]
 
 
 def test_the_mean_along_z_is_that_of_three_cells(column_of_cells):
-    means = mean_along_z(column_of_cells.around(0, 2, 1), 3)[:, 0, 0]
+    means = mean_along_z(column_of_cells.around(first=0, end=2, reach=1), height=3)[:, 0, 0]
     assert means == pytest.approx([(100 + 100 + 200) / 3, (100 + 200 + 400) / 3])
 
 

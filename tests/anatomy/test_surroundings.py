@@ -61,7 +61,7 @@ def test_report_counts_the_voxels_left_out_beside_a_body_and_has_the_highest_val
 
 
 def test_integers_without_room_above_their_values_become_floats_of_the_same_values() -> None:
-    volume, _, _ = make_trunk(np.int16, 30)  # up to 6,000 from -30,000: twice that range does not fit int16
+    volume, _, _ = make_trunk(np.int16, step=30)  # up to 6,000 from -30,000: twice that range does not fit int16
     changed = leave_out_surroundings(volume)
     assert changed.voxels.dtype == np.float32
     stays = changed.voxels <= 30 * PLATE

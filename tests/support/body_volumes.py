@@ -18,7 +18,7 @@ def ellipse(x: float, y: float, a: float, b: float) -> np.ndarray:
     return ((X - x) / a) ** 2 + ((Y - y) / b) ** 2 <= 1.0
 
 
-def make_patient(lungs: bool = False, arms: bool = True, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
+def make_patient(*, lungs: bool = False, arms: bool = True, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
     """HU and the mask of the patient: body with spine and ribs, arms with bone, a gas bubble, an ear-like flap."""
     hu = np.full(SHAPE, -1000.0)
     body = ellipse(0, -10, 120, 75)
