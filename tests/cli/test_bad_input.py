@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from ct_files import sphere_voxels, write_series
+from ct_files import INSIDE_HU, sphere_voxels, write_series
 from printed_text import Printer
 
 import clrecon.operators.surface.extraction
@@ -31,7 +31,10 @@ def target(tmp_path: Path) -> Path:
     return folder / "bone.stl"
 
 
-def check_one_line_of_error(arguments: list[str], code: int, fact: str | float, target: Path, printed: Printer) -> None:
+def check_one_line_of_error(
+    arguments: list[str], target: Path, printed: Printer, *, code: int, fact: str | float
+) -> None:
+    """Run a command that ends with `code`, one line with `fact`, and nothing written beside `target`."""
     found = main(arguments)
     said = printed()
     assert found == code, said
@@ -59,7 +62,7 @@ def make_picture(folder: Path) -> None:
 def make_cut_slices(folder: Path) -> None:
     write_series(folder)
     for path in folder.iterdir():
-        path.write_bytes(path.read_bytes()[:-700])
+        path.write_bytes(path.read_bytes()[:-700])  # of the 1,550 bytes of 25 x 31 pixels
 
 
 def make_one_slice(folder: Path) -> None:
@@ -100,7 +103,7 @@ def test_mesh_of_an_input_without_a_usable_ct_series_is_refused_in_one_line_and_
     make_input(folder)
     report = target.with_suffix(".json")
     check_one_line_of_error(
-        ["mesh", str(folder), "-o", str(target), "--report", str(report)], code, fact, target, printed
+        ["mesh", str(folder), "-o", str(target), "--report", str(report)], target, printed, code=code, fact=fact
     )
 
 
@@ -119,7 +122,7 @@ def test_folder_without_permission_is_refused(tmp_path: Path, target: Path, prin
     folder = write_series(tmp_path / "ct")
     folder.chmod(0)
     try:
-        check_one_line_of_error(["mesh", str(folder), "-o", str(target)], 2, "read", target, printed)
+        check_one_line_of_error(["mesh", str(folder), "-o", str(target)], target, printed, code=2, fact="read")
     finally:
         folder.chmod(0o700)
 
@@ -129,22 +132,20 @@ def test_iso_value_above_all_voxels_is_refused_with_the_highest_of_the_scan(
 ) -> None:
     folder = write_series(tmp_path / "ct")
     arguments = ["mesh", str(folder), "-o", str(target), "--hu", "900", "--device", str(device.index)]
-    check_one_line_of_error(arguments, 2, 700, target, printed)
+    check_one_line_of_error(arguments, target, printed, code=2, fact=INSIDE_HU)
 
 
 def test_volume_of_one_value_is_refused(device: Any, tmp_path: Path, target: Path, printed: Printer) -> None:
     folder = write_series(tmp_path / "ct", np.full((4, 9, 7), -1000, np.int16))
-    check_one_line_of_error(
-        ["mesh", str(folder), "-o", str(target), "--device", str(device.index)], 4, 4 * 9 * 7,
-        target, printed,
-    )  # fmt: skip
+    arguments = ["mesh", str(folder), "-o", str(target), "--device", str(device.index)]
+    check_one_line_of_error(arguments, target, printed, code=4, fact=4 * 9 * 7)  # all of its voxels
 
 
 def test_unknown_device_is_refused_by_the_mesh_command(
     device: Any, tmp_path: Path, target: Path, printed: Printer
 ) -> None:
     arguments = ["mesh", str(tmp_path), "-o", str(target), "--device", "abacus"]
-    check_one_line_of_error(arguments, 5, "abacus", target, printed)
+    check_one_line_of_error(arguments, target, printed, code=5, fact="abacus")
 
 
 @pytest.mark.parametrize(
@@ -172,14 +173,13 @@ def test_output_that_cannot_be_written_is_refused_before_the_input_is_looked_for
 
 def test_report_in_a_missing_folder_is_refused(tmp_path: Path, target: Path, printed: Printer) -> None:
     report = str(tmp_path / "nowhere" / "report.json")
-    check_one_line_of_error(
-        ["mesh", str(tmp_path), "-o", str(target), "--report", report], 6, "nowhere", target, printed
-    )
+    arguments = ["mesh", str(tmp_path), "-o", str(target), "--report", report]
+    check_one_line_of_error(arguments, target, printed, code=6, fact="nowhere")
 
 
 def test_report_named_as_the_mesh_is_refused(tmp_path: Path, target: Path, printed: Printer) -> None:
-    same = str(target)
-    check_one_line_of_error(["mesh", str(tmp_path), "-o", same, "--report", same], 3, "same", target, printed)
+    arguments = ["mesh", str(tmp_path), "-o", str(target), "--report", str(target)]
+    check_one_line_of_error(arguments, target, printed, code=3, fact="same")
 
 
 @pytest.mark.parametrize(
@@ -204,7 +204,7 @@ def test_report_named_as_the_mesh_is_refused(tmp_path: Path, target: Path, print
 def test_wrong_option_of_mesh_is_refused_in_one_line_with_exit_code_3(
     extra: list[str], fact: str, tmp_path: Path, target: Path, printed: Printer
 ) -> None:
-    check_one_line_of_error(["mesh", str(tmp_path), "-o", str(target), *extra], 3, fact, target, printed)
+    check_one_line_of_error(["mesh", str(tmp_path), "-o", str(target), *extra], target, printed, code=3, fact=fact)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tolerances
-from ct_files import ORIGIN, RADIUS_MM, SPACING, find_words, write_series
+from ct_files import ORIGIN, RADIUS_MM, SPACING, find_words, sphere_voxels, write_series
 from printed_text import Printer
 
 from clrecon.cli.common import Parser
@@ -23,6 +23,8 @@ CONTRACT = {
 }  # fmt: skip
 SECONDS = {"read", "upload", "build", "kernels", "download", "write", "total"}
 TRUE_VOLUME_ML = 4.0 / 3.0 * math.pi * RADIUS_MM**3 / 1000.0
+CENTRE = np.array(ORIGIN) + np.array(SPACING) * (15, 12, 8)
+"""Of the sphere in the middle of 31 x 25 x 17 voxels; its surface lies at -150 HU, half way from -1000 to 700."""
 
 
 def read_stl(path: Path) -> np.ndarray:
@@ -35,7 +37,8 @@ def read_stl(path: Path) -> np.ndarray:
 
 @pytest.fixture(scope="session")
 def ct(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_series(tmp_path_factory.mktemp("cli") / "Scan von Größe 3")
+    """A sphere in 17 slices of 31 x 25 voxels."""
+    return write_series(tmp_path_factory.mktemp("cli") / "Scan von Größe 3", sphere_voxels((17, 25, 31)))
 
 
 @pytest.mark.every_device
@@ -47,8 +50,8 @@ def test_mesh_of_a_sphere_lies_at_its_place_in_lps_and_ras(
     arguments = ["mesh", str(ct), "-o", str(output), "--hu", "-150", "--space", space]
     assert main([*arguments, "--device", str(device.index), "-q"]) == 0
     corners = read_stl(output).reshape(-1, 3)
-    centre = (np.array(ORIGIN) + np.array(SPACING) * np.array([15, 12, 8])) * signs
-    np.testing.assert_allclose(0.5 * (corners.min(axis=0) + corners.max(axis=0)), centre, atol=0.05)
+    middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
+    np.testing.assert_allclose(middle, CENTRE * signs, atol=1e-4)  # float32 in the file
 
 
 def test_report_of_a_sphere_has_its_volume_bounds_and_file(
@@ -205,19 +208,16 @@ def test_several_meshes_of_one_job_are_printed_one_by_one(
 def test_seed_with_a_negative_first_number_is_read_as_a_value(
     spaced: bool, device: Any, ct: Path, tmp_path: Path, printed: Printer
 ) -> None:
-    centre = np.array(ORIGIN) + np.array(SPACING) * np.array([15, 12, 8])
-    seeds = [",".join(f"{value:.3f}" for value in centre + [0, 0, step]) for step in (0, RADIUS_MM)]
+    seeds = [",".join(f"{value:.3f}" for value in CENTRE + [0, 0, step]) for step in (0, RADIUS_MM)]
     assert seeds[0].startswith("-")
     extra = [word for seed in seeds for word in (["--seed", seed] if spaced else [f"--seed={seed}"])]
     arguments = ["mesh", str(ct), *extra, "-o", str(tmp_path / "a.stl"), "--json", "--device", str(device.index)]
     assert main([*arguments, "--hu", "-150"]) == 0
     report = printed().report()
     assert report["seeds_mm"] == [[float(value) for value in seed.split(",")] for seed in seeds]
-    inside, on = report["meshes"][0]["seed_distances_mm"]
-    assert (inside, on) == (
-        pytest.approx(RADIUS_MM, abs=tolerances.CLI_SPHERE_RADIUS_MM),
-        pytest.approx(0.0, abs=tolerances.CLI_SPHERE_RADIUS_MM),
-    )
+    of_centre, of_surface = report["meshes"][0]["seed_distances_mm"]
+    assert of_centre == pytest.approx(RADIUS_MM, abs=tolerances.CLI_SPHERE_RADIUS_MM)
+    assert of_surface == pytest.approx(0.0, abs=tolerances.CLI_SPHERE_RADIUS_MM)
 
 
 @pytest.mark.parametrize(
@@ -277,7 +277,7 @@ def test_trilinear_topology_joins_voxels_that_touch_at_an_edge_which_the_default
 @pytest.fixture(scope="module")
 def two_series(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder of series 1 of 17 slices, and 2 of 6."""
-    folder = write_series(tmp_path_factory.mktemp("series") / "ct", number=1)
+    folder = write_series(tmp_path_factory.mktemp("series") / "ct", sphere_voxels((17, 25, 31)), number=1)
     return write_series(folder, np.full((6, 9, 9), -1000, np.int16), number=2)
 
 
@@ -287,7 +287,7 @@ def test_largest_of_two_series_is_taken_with_a_warning(
     assert main(["mesh", str(two_series), "-o", str(tmp_path / "a.stl"), "--device", str(device.index)]) == 0
 
     said = printed()
-    said.assert_output(17)
+    said.assert_output(17)  # slices of the larger one
     said.assert_error(2, "CT")
 
 

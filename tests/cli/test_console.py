@@ -152,7 +152,7 @@ def test_missing_standard_output_ends_with_6_only_where_something_is_printed_and
 
 def test_progress_is_silent_without_a_terminal(printed: Printer) -> None:
     console = Console()
-    console.progress("read", 3, 10)
+    console.progress("read", done=3, total=10)
     console.finish()
     assert printed().is_silent
 
@@ -162,9 +162,9 @@ def test_progress_moves_on_a_terminal_and_is_removed(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setenv("TERM", "xterm")
     console = Console()
-    console.progress("read", 5, 10)
+    console.progress("read", done=5, total=10)
     assert "reading slices [############............] 5/10" in terminal.getvalue()
-    console.progress("build", 0, 0)
+    console.progress("build", done=0, total=0)
     assert "building kernels (takes seconds on the first run" in terminal.getvalue()
     console.finish()
     assert terminal.getvalue().endswith(" \r")
@@ -186,7 +186,7 @@ def test_progress_on_a_narrow_terminal_keeps_its_count(
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setattr(os, "get_terminal_size", lambda _: os.terminal_size((columns, 24)))
-    Console().progress("scan", 25, 95)
+    Console().progress("scan", done=25, total=95)
     assert terminal.getvalue().strip() == expected and len(expected) < columns
 
 
@@ -195,7 +195,7 @@ def test_quiet_console_shows_no_progress_and_no_warnings_on_a_terminal(monkeypat
     monkeypatch.setattr(sys, "stderr", terminal)
     console = Console()
     console.set_loudness(quiet=True, verbose=False)
-    console.progress("read", 5, 10)
+    console.progress("read", done=5, total=10)
     console.warn("hidden")
     assert terminal.getvalue() == ""
 
@@ -204,7 +204,7 @@ def test_verbose_console_prints_a_line_for_each_stage(capsys: pytest.CaptureFixt
     console = Console()
     console.set_loudness(quiet=False, verbose=True)
     for done in range(4):
-        console.progress("read", done, 3)
+        console.progress("read", done=done, total=3)
     console.progress("write")
     lines = capsys.readouterr().err.splitlines()
     assert [line.split("  ")[-1] for line in lines] == ["reading slices", "writing"]

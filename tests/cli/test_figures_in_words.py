@@ -55,7 +55,7 @@ def test_gaps_between_slices_are_listed_by_their_runs_up_to_a_number(found: list
 def test_patients_are_separated_by_a_line_in_the_table_of_series() -> None:
     entries = [{"number": n, "patient": who} for n, who in enumerate(("a", "a", "b"), start=1)]
     columns = [info._Column("series", [str(n) for n in (1, 2, 3)])]
-    table = info._make_table(columns, entries, 1)
+    table = info._make_table(columns, entries, chosen=1)
     assert [row.end_section for row in table.rows] == [False, True, False]
 
 
@@ -133,7 +133,7 @@ def test_warning_is_printed_unless_it_is_in_the_json_or_quiet(
     as_json: bool, quiet: bool, with_json: bool, is_printed: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
     made = Console(as_json=as_json)
-    made.set_loudness(quiet, False)
+    made.set_loudness(quiet, verbose=False)
 
     made.warn("cold", with_json=with_json)
 
@@ -269,7 +269,7 @@ def test_strict_exit_code_is_that_of_a_failed_gate_of_the_mesh_before_one_of_the
         return {"name": name, "ok": ok, "text": "t", "measured": 1, "bound": 0, "unit": None, **more}
 
     report = {
-        "volume": {"gates": [gate("lossless", scan_passes), gate("grid_residual", False)]},
+        "volume": {"gates": [gate("lossless", scan_passes), gate("grid_residual", ok=False)]},
         "gates": [gate("closed", mesh_passes, mesh="m")],
         "warnings": [],
     }
@@ -284,7 +284,7 @@ def test_failed_gate_of_hu_is_a_warning_where_the_level_is_in_the_values_own_uni
 ) -> None:
     gate = {"name": name, "ok": False, "text": "t", "measured": 1, "bound": 0, "unit": None}
     report = {"volume": {"gates": [gate]}, "gates": [], "warnings": []}
-    assert mesh_command.finish_with_gates(report, Console(), True, own_units=own_units) == code
+    assert mesh_command.finish_with_gates(report, Console(), strict=True, own_units=own_units) == code
 
 
 def test_simulated_device_is_listed_as_a_simulator() -> None:
@@ -403,8 +403,8 @@ def test_progress_on_a_very_narrow_terminal_has_20_characters(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(os, "get_terminal_size", lambda _: os.terminal_size((5, 24)))
-    Console()._draw("x" * 50, 0, 0)
-    assert capsys.readouterr().err == "\rclrecon: " + "x" * 11
+    Console()._draw("x" * 50, done=0, total=0)
+    assert capsys.readouterr().err == "\rclrecon: " + "x" * (20 - len("clrecon: "))
 
 
 def test_help_of_render_names_its_output(printed: Printer) -> None:

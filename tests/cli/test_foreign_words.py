@@ -82,7 +82,7 @@ def test_nifti_with_an_infinite_sform_is_refused_in_one_line(tmp_path: Path) -> 
 
     header = nibabel.Nifti1Image(np.zeros((3, 4, 5), np.int16), np.eye(4)).header
     header["sform_code"], header["srow_x"] = 1, [np.inf, np.inf, -np.inf, np.inf]
-    (tmp_path / "a.nii").write_bytes(header.binaryblock + bytes(4 + 120))
+    (tmp_path / "a.nii").write_bytes(header.binaryblock + bytes(4 + 60 * 2))  # no extension, and 60 voxels of int16
     done = subprocess.run([*CLRECON, "info", "a.nii"], cwd=tmp_path, capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (4, "")
     assert done.stderr.count("\n") == 1 and done.stderr.startswith("clrecon: error: a.nii ")

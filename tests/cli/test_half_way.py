@@ -18,7 +18,7 @@ BONE_HU, TISSUE_HU = 700, 0
 
 @pytest.fixture(scope="module")
 def ct(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A ball of 700 HU in water."""
+    """A ball of `BONE_HU` in water of `TISSUE_HU`."""
     voxels = ct_files.sphere_voxels((17, 31, 37))
     inside = (voxels - ct_files.OUTSIDE_HU) / (ct_files.INSIDE_HU - ct_files.OUTSIDE_HU)
     hu = TISSUE_HU + inside * (BONE_HU - TISSUE_HU)
@@ -56,7 +56,7 @@ def test_words_of_half_have_the_iso_value_and_both_materials(
     ct: Path, device: Any, tmp_path: Path, printed: Printer
 ) -> None:
     assert run(ct, device, tmp_path, "--hu", "half:700,0") == 0
-    printed().assert_output(350, 0, 700)
+    printed().assert_output((700 + 0) / 2, 0, 700)
 
 
 def test_auto_without_bone_ends_with_2_and_writes_nothing(device: Any, tmp_path: Path, printed: Printer) -> None:

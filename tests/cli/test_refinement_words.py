@@ -13,14 +13,11 @@ from clrecon.cli.mesh import describe_refinement, finish_with_gates
 pytestmark = pytest.mark.unit
 
 
-def describe_decimation(**topology: int) -> str:
-    numbers = {
-        "euler_number_before": 1454, "euler_number_after": 1454, "components_before": 932, "components_lost": 0,
-        "components_changed": 0,
-    } | topology  # fmt: skip
-    deviation: dict[str, Any] = {"hd95_mm": 0.1, "assd_mm": 0.05, "max_mm": 0.2, "volume_change_percent": None}
-    found = {"fraction": 0.9, "reached": 0.8359, "ended_by": "bound", "max_deviation_mm": 0.175, "topology": numbers}
-    return describe_refinement([{"refinement": {"decimate": found, "deviation": deviation, "voxel_mm": 0.7}}])[0]
+DEVIATION: dict[str, Any] = {"hd95_mm": 0.1, "assd_mm": 0.05, "max_mm": 0.2, "volume_change_percent": None}
+UNCHANGED = {
+    "euler_number_before": 1454, "euler_number_after": 1454, "components_before": 932, "components_lost": 0,
+    "components_changed": 0,
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -41,7 +38,12 @@ def describe_decimation(**topology: int) -> str:
     ],
 )
 def test_words_of_decimation_have_the_euler_number_before_and_after(topology: dict[str, int], words: str) -> None:
-    line = describe_decimation(**topology)
+    decimate = {
+        "fraction": 0.9, "reached": 0.8359, "ended_by": "bound", "max_deviation_mm": 0.175,
+        "topology": UNCHANGED | topology,
+    }  # fmt: skip
+    refinement = {"decimate": decimate, "deviation": DEVIATION, "voxel_mm": 0.7}
+    line, *_ = describe_refinement([{"refinement": refinement}])
     assert line.startswith(
         "refined  83.6 % of the triangles removed; the error bound of 0.175 mm does not allow 90 %; "
     )
@@ -86,7 +88,6 @@ def test_each_failed_gate_of_scan_and_mesh_is_a_line_of_errors_with_strict(
     ],
 )
 def test_words_of_smoothing_have_iterations_roughness_and_components_left_out(left: int, expected: str) -> None:
-    deviation: dict[str, Any] = {"hd95_mm": 0.1, "assd_mm": 0.05, "max_mm": 0.2, "volume_change_percent": None}
-    found = {"iterations": 1, "components_left": left, "roughness_before_mm": 0.2, "roughness_after_mm": 0.05}
-    line = describe_refinement([{"refinement": {"smooth": found, "deviation": deviation, "voxel_mm": 0.7}}])[0]
+    smooth = {"iterations": 1, "components_left": left, "roughness_before_mm": 0.2, "roughness_after_mm": 0.05}
+    line, *_ = describe_refinement([{"refinement": {"smooth": smooth, "deviation": DEVIATION, "voxel_mm": 0.7}}])
     assert line == f"refined  {expected}"

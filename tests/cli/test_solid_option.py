@@ -44,7 +44,7 @@ def report_of_egg(bone, folder, *options: object, device) -> dict:
 def test_solid_mesh_of_a_hollow_egg_has_its_whole_volume_and_passes_its_gates(device, bone, tmp_path):
     report = report_of_egg(bone, tmp_path, "--solid", device=device)
 
-    assert report["volume_ml"] == pytest.approx(SOLID_ML, rel=0.01)  # voxels of 1 mm
+    assert report["volume_ml"] == pytest.approx(SOLID_ML, rel=0.01)  # in voxels of 1 mm: measured 0.3 % more
     assert report["seconds"]["solid"] > 0.0
     assert [gate["name"] for gate in report["gates"] if gate["ok"] is False] == []
 
@@ -52,8 +52,8 @@ def test_solid_mesh_of_a_hollow_egg_has_its_whole_volume_and_passes_its_gates(de
 def test_mesh_of_a_hollow_egg_that_is_not_solid_has_the_volume_of_its_wall(device, bone, tmp_path):
     report = report_of_egg(bone, tmp_path, "--no-solid", device=device)
 
-    wall_ml = SOLID_ML - 1.1 * 4 / 3 * np.pi * 14.0**3 / 1000
-    assert report["volume_ml"] == pytest.approx(wall_ml, rel=0.03)
+    hollow_ml = 1.1 * 4 / 3 * np.pi * 14.0**3 / 1000  # 28 mm wide
+    assert report["volume_ml"] == pytest.approx(SOLID_ML - hollow_ml, rel=0.03)  # measured 1.4 % more
     assert "solid" not in report["volume"]
 
 
@@ -70,7 +70,7 @@ def test_print_of_a_hollow_egg_is_solid_unless_it_is_asked_to_be_hollow(device, 
     solid = report_of_egg(bone, tmp_path, "--for", "print", device=device)
     hollow = report_of_egg(bone, tmp_path, "--for", "print", "--no-solid", device=device)
 
-    assert solid["volume_ml"] > 1.5 * hollow["volume_ml"]  # the hollow is 14 of 18 mm wide
+    assert solid["volume_ml"] > 1.5 * hollow["volume_ml"]  # by radii of 18 and 14 mm 1.9 times as much
 
 
 @pytest.mark.parametrize(

@@ -132,4 +132,4 @@ def test_noun_of_a_count_is_singular_for_1_alone(count: int, words: str) -> None
 
 
 def test_noun_of_a_count_has_the_given_plural() -> None:
-    assert count_of(2, "body", "bodies") == "2 bodies"
+    assert count_of(2, "body", several="bodies") == "2 bodies"
