@@ -46,11 +46,9 @@ def test_memory_of_control_groups_is_free_memory_of_each_group_up_to_their_root(
 def test_volume_larger_than_the_free_memory_is_refused_with_both_in_gib(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory, "available_memory_bytes", lambda: 2.0**30)
     with pytest.raises(RefusedInputError) as caught:
-        memory.allocate_voxels((1 << 10, 1 << 10, 3 << 9), np.int16, "a.nii")
-    assert (
-        str(caught.value)
-        == "a.nii: the volume of 1536 x 1024 x 1024 voxels needs 3.00 GiB of memory, 1.00 GiB are free"
-    )
+        memory.allocate_voxels((1024, 1024, 1536), np.int16, name="a.nii")  # (k, j, i), 2 bytes a voxel
+    needed = "the volume of 1536 x 1024 x 1024 voxels needs 3.00 GiB of memory"
+    assert str(caught.value) == f"a.nii: {needed}, 1.00 GiB are free"
 
 
 def test_volume_that_fits_into_the_free_memory_is_allocated() -> None:
@@ -148,9 +146,9 @@ def test_extension_in_capitals_is_found() -> None:
 
 def test_file_is_read_up_to_its_largest_size_and_refused_a_byte_above(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"1234")
-    assert read_regular(tmp_path / "a", 4) == b"1234"
+    assert read_regular(tmp_path / "a", limit=4) == b"1234"
     with refused(OSError, "bytes", 3):
-        read_regular(tmp_path / "a", 3)
+        read_regular(tmp_path / "a", limit=3)
 
 
 @pytest.mark.parametrize("is_shown", [False, True])
@@ -169,7 +167,7 @@ def test_warnings_of_libraries_are_not_shown_by_default() -> None:
 @pytest.mark.parametrize(("package", "name"), [(None, "no_such_module"), ("other-name", "other-name")])
 def test_missing_package_is_named_as_it_is_installed(package: str | None, name: str) -> None:
     with refused(UsageError, name):
-        import_package("no_such_module", "a table", package)
+        import_package("no_such_module", subject="a table", package=package)
 
 
 def test_default_time_limit_of_a_device_is_ten_minutes() -> None:

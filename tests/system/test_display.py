@@ -11,6 +11,7 @@ from clrecon.system.display import Display, DisplayProbe, read_words
 
 
 def printed_by_child(*facts: dict[str, object]) -> bytes:
+    """What a process that tries a display prints: a line of JSON for each."""
     return b"".join(json.dumps(each).encode() + b"\n" for each in facts)
 
 
@@ -36,22 +37,22 @@ START = {"display": True, "window": "vtkXOpenGLRenderWindow"}
             "OpenGL does not work on the display :5: what was drawn is not seen",
         ),
     ],
-    ids=["no answer", "crash", "crash in a shell", "no VTK", "no GLX", "nothing drawn"],
+    ids=["no answer", "crash", "crash by code of a shell", "no VTK", "no GLX", "nothing drawn"],
 )
 def test_fault_of_a_display_is_read_from_the_output_and_exit_code(output, code, fault, monkeypatch):
     monkeypatch.setenv("DISPLAY", ":5")
-    assert read_words(output, code) == Display(fault)
+    assert read_words(output, code) == Display(fault=fault)
 
 
 def test_display_that_draws_has_no_fault_and_the_name_of_its_driver(monkeypatch):
     monkeypatch.setenv("DISPLAY", ":5")
     output = printed_by_child(START, {**START, "drawn": True, "driver": ["llvmpipe (LLVM 15)"]})
-    assert read_words(output, 0) == Display(None, "llvmpipe (LLVM 15)")
+    assert read_words(output, 0) == Display(fault=None, driver="llvmpipe (LLVM 15)")
 
 
 @pytest.mark.parametrize(("driver", "is_software"), [("llvmpipe (LLVM 15)", True), ("NVIDIA H100", False)])
 def test_llvmpipe_is_a_software_driver(driver, is_software):
-    assert Display(None, driver).is_software == is_software
+    assert Display(driver=driver).is_software == is_software
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="displays have names in X11")

@@ -21,12 +21,13 @@ from clrecon.system.records import at_least, at_most
 def test_figure_of_a_gate_has_the_digits_that_tell_it_from_its_upper_bound(
     measured: float, unit: str | None, text: str
 ) -> None:
-    assert at_most("p95", measured, 0.25, unit, "distance").text == text
+    assert at_most("p95", measured, bound=0.25, unit=unit, subject="distance").text == text
 
 
 def test_figure_of_a_gate_has_the_digits_that_tell_it_from_its_lower_bound() -> None:
-    assert at_least("kept", 0.9799999, 0.98, None, "bone").text == "bone: 0.9799999, at least 0.98"
+    gate = at_least("kept", 0.9799999, bound=0.98, unit=None, subject="bone")
+    assert gate.text == "bone: 0.9799999, at least 0.98"
 
 
 def test_figure_that_is_nan_fails_its_gate() -> None:
-    assert at_most("p95", math.nan, 0.25, None, "distance").ok is False
+    assert at_most("p95", math.nan, bound=0.25, unit=None, subject="distance").ok is False

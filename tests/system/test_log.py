@@ -20,12 +20,14 @@ from clrecon.opencl import cache
 from clrecon.opencl.cache import prepare_caches
 
 NAME = "Mueller^Hans"
+SHAPE = (20, 31, 30)
 
 
 @pytest.fixture(scope="module")
-def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def scan_of_mueller(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A series whose folder, files and headers name the patient, and whose lossy compression is warned of."""
     folder = tmp_path_factory.mktemp("log") / NAME
-    plan = Plan(shape=(20, 31, 30), name=f"{NAME}_{{:03d}}.dcm".format)
+    plan = Plan(shape=SHAPE, name=f"{NAME}_{{:03d}}.dcm".format)
     write_series(folder, plan, set_values(PatientName=NAME, SeriesDescription=NAME, LossyImageCompression="01"))
     return folder
 
@@ -55,8 +57,8 @@ class LoggedJob:
 
 
 @pytest.fixture(scope="module")
-def job(device: Any, scan: Path, tmp_path_factory: pytest.TempPathFactory) -> LoggedJob:
-    """A mesh of the scan, whose folder, file names and header name the patient."""
+def job(device: Any, scan_of_mueller: Path, tmp_path_factory: pytest.TempPathFactory) -> LoggedJob:
+    """A mesh of the scan, in a file named as the patient."""
     written = tmp_path_factory.mktemp("job") / f"{NAME}.stl"
     settings = MeshSettings(iso_value=200.0, device=str(device.index))
     collected = CollectedRecords()
@@ -65,7 +67,7 @@ def job(device: Any, scan: Path, tmp_path_factory: pytest.TempPathFactory) -> Lo
     logger.addHandler(collected)
     logger.setLevel(logging.DEBUG)
     try:
-        report = make_mesh(scan, written, settings, report_path=written.with_name("a.json"))
+        report = make_mesh(scan_of_mueller, written, settings, report_path=written.with_name("a.json"))
     finally:
         logger.removeHandler(collected)
         logger.setLevel(level)
@@ -77,7 +79,7 @@ def test_log_of_a_job_has_its_device_series_file_and_meshes(job: LoggedJob, devi
     [made] = [text for text in job.messages if text.startswith("1 meshes made, ")]
     assert device.label in chosen
     assert device.label in made
-    assert "series 1 of 1 read: (30, 31, 20) voxels int16" in job.messages
+    assert f"series 1 of 1 read: {SHAPE[::-1]} voxels int16" in job.messages
     assert f"file written: {job.written.stat().st_size} bytes" in job.messages
 
 
@@ -130,9 +132,9 @@ def test_missing_and_whole_binaries_of_programs_are_not_logged(caplog: pytest.Lo
     assert caplog.messages == []
 
 
-def test_log_of_reading_is_not_printed_without_a_handler(scan: Path) -> None:
+def test_log_of_reading_is_not_printed_without_a_handler(scan_of_mueller: Path) -> None:
     code = "import clrecon, sys; volume = clrecon.read_volume(sys.argv[1]); assert volume.report['warnings']"
-    done = subprocess.run([sys.executable, "-c", code, str(scan)], capture_output=True, check=True)
+    done = subprocess.run([sys.executable, "-c", code, str(scan_of_mueller)], capture_output=True, check=True)
     assert (done.stdout, done.stderr) == (b"", b"")
 
 

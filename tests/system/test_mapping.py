@@ -14,7 +14,8 @@ VOXELS = np.arange(6 * 64 * 64, dtype=np.int16).reshape(6, 64, 64)
 
 
 @pytest.fixture
-def file(tmp_path):
+def voxel_file(tmp_path):
+    """A file of `VOXELS`, to be mapped."""
     np.save(tmp_path / "voxels.npy", VOXELS)
     return tmp_path / "voxels.npy"
 
@@ -29,8 +30,8 @@ def file(tmp_path):
         pytest.param(lambda mapped: np.ascontiguousarray(mapped)[1:], id="slices of a contiguous array"),
     ],
 )
-def test_mapping_of_a_file_is_found_through_a_view_of_it(file, mode, make_view):
-    view = make_view(np.load(file, mmap_mode=mode))
+def test_mapping_of_a_file_is_found_through_a_view_of_it(voxel_file, mode, make_view):
+    view = make_view(np.load(voxel_file, mmap_mode=mode))
     mapping = find_mapping(view)
     assert mapping is not None
     assert mapping.address < view.ctypes.data < mapping.address + len(mapping.file)
@@ -45,18 +46,18 @@ def test_array_in_an_anonymous_mapping_has_no_mapping_of_a_file():
     assert find_mapping(anonymous) is None
 
 
-def test_value_written_to_a_private_mapping_is_kept_when_its_slices_are_released(file):
+def test_value_written_to_a_private_mapping_is_kept_when_its_slices_are_released(voxel_file):
     """It stands in memory alone: a released page would be read from the file."""
-    private = np.load(file, mmap_mode="c")
+    private = np.load(voxel_file, mmap_mode="c")
     private[0, 0, 0] = -5
     assert find_mapping(private) is None
-    Volume(private, np.eye(4)).release_slices(0, 6)
+    Volume(private, np.eye(4)).release_slices(first=0, end=6)
     assert private[0, 0, 0] == -5
 
 
 @pytest.mark.parametrize(("first", "end"), [(0, 6), (1, 2), (5, 6), (3, 3)])
-def test_released_slices_of_a_shared_mapping_keep_their_values(file, first, end):
-    mapped = np.load(file, mmap_mode="r+")
+def test_released_slices_of_a_shared_mapping_keep_their_values(voxel_file, first, end):
+    mapped = np.load(voxel_file, mmap_mode="r+")
     mapped[3, 2, 1] = -77
     expected = mapped.copy()
     volume = Volume(mapped, np.eye(4))
@@ -64,8 +65,8 @@ def test_released_slices_of_a_shared_mapping_keep_their_values(file, first, end)
     assert np.array_equal(volume.voxels, expected)
 
 
-def test_only_whole_pages_within_the_released_slices_are_released(file):
-    mapped = np.load(file, mmap_mode="r")
+def test_only_whole_pages_within_the_released_slices_are_released(voxel_file):
+    mapped = np.load(voxel_file, mmap_mode="r")
     mapping = find_mapping(mapped)
     released = []
 

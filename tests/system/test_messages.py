@@ -56,7 +56,7 @@ PLANE = MiddlePlane(
     EMPTY, EMPTY, EMPTY.astype(np.int32), EMPTY.astype(np.int32), 1, 2, [((0.0, 1.0), (2.0, 3.0))], [0.5]
 )
 
-MESSAGES = {
+MESSAGES = {  # whatever they contain: it is compared with itself
     "volume": Volume(VOXELS, AFFINE, {"warnings": ["doubtful"]}),
     "uneven volume": Volume(VOXELS, AFFINE, slice_positions=POSITIONS),
     "mesh": TRIANGLE,
@@ -86,7 +86,7 @@ MESSAGES = {
     "vertebra": VERTEBRA,
     "middle plane": PLANE,
     "vertebra split": VertebraSplit(LABELS, [VERTEBRA], CURVE.points, CURVE.points, 150.0, ["a sacrum"], PLANE),
-    "gate": at_most("gap", 1.0, 2.0, "mm", "a gap"),
+    "gate": at_most("gap", 1.0, bound=2.0, unit="mm", subject="a gap"),
     "quality": TRIANGLE.quality(),
     "point cloud": CLOUD,
     "point step": PointStep(CLOUD, np.array([0, 1, 0], np.uint8), ("noise",), {"eps_mm": 1.2}, ("doubtful",)),
@@ -187,7 +187,8 @@ def test_change_of_a_deep_copy_leaves_the_voxels_and_the_report_of_its_volume():
 
 
 @pytest.fixture
-def file(tmp_path):
+def voxel_file(tmp_path):
+    """A file of `VOXELS`, to be mapped."""
     np.save(tmp_path / "voxels.npy", VOXELS)
     return tmp_path / "voxels.npy"
 
@@ -223,8 +224,8 @@ def test_deep_copy_of_mapped_voxels_is_sent_by_their_place_in_the_file(mapped_me
     assert is_sent_by_place(copy.deepcopy(mapped_message))
 
 
-def test_value_written_through_a_shared_mapping_arrives_in_read_only_voxels(file):
-    mapped = np.load(file, mmap_mode="r+")
+def test_value_written_through_a_shared_mapping_arrives_in_read_only_voxels(voxel_file):
+    mapped = np.load(voxel_file, mmap_mode="r+")
     volume = Volume(mapped, AFFINE)
     mapped[1, 2, 3] = -77
     arrived = pickled(volume)
@@ -232,8 +233,8 @@ def test_value_written_through_a_shared_mapping_arrives_in_read_only_voxels(file
     assert not arrived.voxels.flags.writeable
 
 
-def test_deep_copy_of_a_shared_mapping_has_its_written_values_and_writes_none_to_the_file(file):
-    mapped = np.load(file, mmap_mode="r+")
+def test_deep_copy_of_a_shared_mapping_has_its_written_values_and_writes_none_to_the_file(voxel_file):
+    mapped = np.load(voxel_file, mmap_mode="r+")
     mapped[1, 2, 3] = -77
     copied = copy.deepcopy(Volume(mapped, AFFINE))
     assert copied.voxels[1, 2, 3] == -77
@@ -241,36 +242,36 @@ def test_deep_copy_of_a_shared_mapping_has_its_written_values_and_writes_none_to
     assert mapped[0, 0, 0] == 0
 
 
-def test_private_mapping_is_sent_with_its_values(file):
-    mapped = np.load(file, mmap_mode="c")
+def test_private_mapping_is_sent_with_its_values(voxel_file):
+    mapped = np.load(voxel_file, mmap_mode="c")
     mapped[1, 2, 3] = -77
     volume = Volume(mapped, AFFINE)
-    file.unlink()
+    voxel_file.unlink()
     assert pickled(volume).voxels[1, 2, 3] == -77
 
 
 @pytest.mark.parametrize("is_replaced", [False, True])
-def test_mapped_voxels_whose_file_was_removed_or_replaced_before_are_sent_with_their_values(file, is_replaced):
-    volume = Volume(np.load(file, mmap_mode="r"), AFFINE)
-    file.unlink()
+def test_mapped_voxels_whose_file_was_removed_or_replaced_before_are_sent_with_their_values(voxel_file, is_replaced):
+    volume = Volume(np.load(voxel_file, mmap_mode="r"), AFFINE)
+    voxel_file.unlink()
     if is_replaced:
-        np.save(file, VOXELS + 1)
+        np.save(voxel_file, VOXELS + 1)
     arrived = pickled(volume)
     assert np.array_equal(arrived.voxels, VOXELS)
     assert not arrived.voxels.flags.writeable
 
 
-def test_message_whose_file_was_removed_on_its_way_is_refused_with_the_file(file):
-    sent = pickle.dumps(Volume(np.load(file, mmap_mode="r"), AFFINE))
-    file.unlink()
+def test_message_whose_file_was_removed_on_its_way_is_refused_with_the_file(voxel_file):
+    sent = pickle.dumps(Volume(np.load(voxel_file, mmap_mode="r"), AFFINE))
+    voxel_file.unlink()
     with refused(RefusedInputError, "voxels.npy"):
         pickle.loads(sent)
 
 
 @pytest.mark.parametrize("values", [VOXELS + 1, VOXELS[:2]], ids=["other values", "fewer values"])
-def test_message_whose_file_was_changed_on_its_way_is_refused_with_the_file(file, values):
-    sent = pickle.dumps(Volume(np.load(file, mmap_mode="r"), AFFINE))
-    np.save(file, values)
+def test_message_whose_file_was_changed_on_its_way_is_refused_with_the_file(voxel_file, values):
+    sent = pickle.dumps(Volume(np.load(voxel_file, mmap_mode="r"), AFFINE))
+    np.save(voxel_file, values)
     with refused(RefusedInputError, "voxels.npy"):
         pickle.loads(sent)
 
@@ -285,8 +286,8 @@ sys.stdout.buffer.write(pickle.dumps(volume))
 """
 
 
-def test_mapped_volume_comes_back_from_another_process_with_its_voxels_slices_and_report(file):
-    volume = Volume(np.load(file, mmap_mode="r"), AFFINE, {"warnings": []}, POSITIONS)
+def test_mapped_volume_comes_back_from_another_process_with_its_voxels_slices_and_report(voxel_file):
+    volume = Volume(np.load(voxel_file, mmap_mode="r"), AFFINE, report={"warnings": []}, slice_positions=POSITIONS)
     command = [sys.executable, "-c", SUM_IN_ANOTHER_PROCESS]
     done = subprocess.run(command, input=pickle.dumps(volume), capture_output=True, check=True)
     back = pickle.loads(done.stdout)

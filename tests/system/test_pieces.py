@@ -65,7 +65,7 @@ def test_work_in_threads_covers_each_row_once(monkeypatch, threads, count):
     def count_call(rows: slice) -> None:
         calls_of_row[rows] += 1
 
-    pieces.in_threads(count_call, count, 64)
+    pieces.in_threads(count_call, count, size=64)
     assert (calls_of_row[:count] == 1).all()
     assert (calls_of_row[count:] == 0).all()
 
@@ -79,4 +79,4 @@ def test_an_error_in_one_piece_is_raised_by_the_whole(monkeypatch, threads):
             raise ValueError("this piece")
 
     with pytest.raises(ValueError, match="this piece"):
-        pieces.in_threads(fail_late, 1000, 64)
+        pieces.in_threads(fail_late, 1000, size=64)

@@ -33,7 +33,7 @@ class Pair(Record):
     _LEFT_OUT = ("note",)
 
 
-GATE = at_most("gap", 1.0, 2.0, "mm", "a gap")
+GATE = at_most("gap", measured=1.0, bound=2.0, unit="mm", subject="a gap")
 CERTIFICATE = Certificate(
     format="DICOM", series={"number": 1}, slices=2, shape_ijk=[4, 3, 2], spacing_mm=[1.0] * 3, extent_mm=None,
     affine_ijk_to_lps_mm=None, orientation=None, tilt_deg=0.0, gap_mm={"min": 1.0}, transfer_syntax_names=[],
@@ -152,6 +152,7 @@ def test_certificate_of_a_grid_file_has_its_entries_in_its_own_order() -> None:
 
 
 def all_records() -> list[type[Record]]:
+    """The classes of records in all modules, those derived from others too."""
     for name in package_modules():
         if name.split(".")[1:2] not in (["cli"], ["__main__"]):
             import_module(name)
@@ -198,5 +199,5 @@ def test_repr_of_a_record_of_many_fields_is_one_line_of_less_than_120_characters
 
 
 def test_repr_of_a_listing_of_series_has_its_counts_alone() -> None:
-    listing = SeriesListing(["x" * 999] * 3, 2, {}, [])
+    listing = SeriesListing(["x" * 999] * 3, chosen=2, skipped={}, warnings=[])
     assert repr(listing) == "SeriesListing(3 series, chosen=2, 0 warnings)"

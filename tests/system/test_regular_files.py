@@ -67,14 +67,14 @@ def test_irregular_file_that_was_refused_is_not_left_open(irregular_file):
 
 def test_regular_file_is_read_up_to_the_largest_size_and_refused_above(tmp_path):
     (tmp_path / "a").write_bytes(b"12345")
-    assert read_regular(tmp_path / "a", 5) == b"12345"
+    assert read_regular(tmp_path / "a", limit=5) == b"12345"
     with refused(OSError, "bytes", 4):
-        read_regular(tmp_path / "a", 4)
+        read_regular(tmp_path / "a", limit=4)
 
 
 def test_regular_file_is_opened_as_a_stream(tmp_path):
     (tmp_path / "a").write_bytes(b"12345")
-    with open_regular(tmp_path / "a", 0) as stream:
+    with open_regular(tmp_path / "a", buffering=0) as stream:
         assert stream.read(2) == b"12"
 
 

@@ -15,7 +15,7 @@ pytestmark = pytest.mark.unit
 
 def test_steps_are_reported_from_none_to_all_and_never_above():
     reported: list[tuple[str, int, int]] = []
-    steps = Steps(lambda *step: reported.append(step), "mask", 7)
+    steps = Steps(lambda *step: reported.append(step), stage="mask", total=7)
     steps.take()
     steps.take_slice(slice(3, 8))
     steps.take(4)  # 10 of 7: work that was begun again
@@ -23,7 +23,7 @@ def test_steps_are_reported_from_none_to_all_and_never_above():
 
 
 def test_steps_without_a_report_are_counted():
-    steps = Steps(None, "mask", 2)
+    steps = Steps(None, stage="mask", total=2)
     steps.take()
     assert steps.done == 1
 
@@ -43,7 +43,7 @@ def test_pieces_of_work_are_reported_in_order_in_the_thread_of_the_caller_after_
         reported.append((piece.start, piece.stop))
         reporting_threads.add(threading.get_ident())
 
-    pieces.in_threads(work, 23, 5, report)
+    pieces.in_threads(work, 23, size=5, done=report)
 
     assert reported == [(0, 5), (5, 10), (10, 15), (15, 20), (20, 23)]
     assert reporting_threads == {threading.get_ident()}
@@ -59,5 +59,5 @@ def test_work_in_threads_is_ended_by_an_error_of_its_report(threads, monkeypatch
 
     piece_count = 1000
     with pytest.raises(Cancelled):
-        pieces.in_threads(lambda piece: worked.append(piece.start), piece_count, 1, cancel)
+        pieces.in_threads(lambda piece: worked.append(piece.start), piece_count, size=1, done=cancel)
     assert len(worked) < piece_count  # the first is reported; a thread may have begun some others by then
