@@ -309,7 +309,7 @@ def downloads(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def view_browser(downloads: Path) -> Iterator[Any]:
     from browser import open_browser
 
-    with open_browser(1200, 800) as driver:
+    with open_browser(width=1200, height=800) as driver:
         driver.execute_cdp_cmd("Page.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(downloads)})
         yield driver
 

@@ -26,7 +26,7 @@ OWN = ("file:", "data:", "blob:", "about:", "chrome:")
 
 
 @contextmanager
-def open_browser(width: int = 900, height: int = 700, *flags: str) -> Iterator[Any]:
+def open_browser(*flags: str, width: int = 900, height: int = 700) -> Iterator[Any]:
     """Start Chromium with a window of a size; skip where it, its driver or selenium is missing."""
     program, driver_path = shutil.which("chromium"), shutil.which("chromedriver")
     if program is None or driver_path is None or find_spec("selenium") is None:

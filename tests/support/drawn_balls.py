@@ -13,9 +13,10 @@ from clrecon.rendering.views.camera import Camera
 
 CENTRE = np.array([12.0, -30.0, 850.0])
 RADIUS = 20.0
+EYE = (10.0, -400.0, 870.0)
 CAMERAS = [
-    Camera((10.0, -400.0, 870.0), tuple(CENTRE), (0.2, 0, 1), parallel_scale=40.0),
-    Camera((10.0, -400.0, 870.0), tuple(CENTRE), (0.2, 0, 1), view_angle=12.0),
+    Camera(position=EYE, focal_point=tuple(CENTRE), up=(0.2, 0, 1), parallel_scale=40.0),
+    Camera(position=EYE, focal_point=tuple(CENTRE), up=(0.2, 0, 1), view_angle=12.0),
 ]
 
 
@@ -30,6 +31,7 @@ def need_off_screen() -> None:
 def ball(
     camera: Camera,
     size: tuple[int, int],
+    *,
     center: np.ndarray = CENTRE,
     radius: float = RADIUS,
     color: tuple[int, int, int] = (250, 40, 10),

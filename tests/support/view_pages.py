@@ -83,11 +83,11 @@ def wait_until_drawn(page: Any) -> None:
     wait_for(page, SETTLED)
 
 
-def drag(page: Any, element: Any, x: int, y: int, dx: int, dy: int, steps: int = 15) -> None:
-    """Drag from a place beside the middle of an element, in small moves."""
+def drag(page: Any, element: Any, *, dx: int, dy: int, steps: int = 15) -> None:
+    """Drag from the middle of an element by some pixels, in small moves."""
     from selenium.webdriver import ActionChains
 
-    actions = ActionChains(page, duration=15).move_to_element_with_offset(element, x, y).click_and_hold()
+    actions = ActionChains(page, duration=15).move_to_element(element).click_and_hold()
     for _ in range(steps):
         actions = actions.move_by_offset(round(dx / steps), round(dy / steps))
     actions.release().perform()

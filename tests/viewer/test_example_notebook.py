@@ -26,6 +26,7 @@ def list_outputs(notebook) -> list[tuple[str, dict[str, str]]]:
 
 
 def check_outputs(notebook) -> None:
+    """Assert that each kind of object shows itself, the last cell a picture, and that nothing is printed."""
     outputs = list_outputs(notebook)
     for name, start in KINDS.items():
         (html,) = [data["text/html"] for source, data in outputs if source == name or f"clrecon.{name}(" in source]
@@ -57,7 +58,8 @@ def test_page_of_the_notebook_is_drawn_after_nbconvert(tmp_path):
     text, _ = nbconvert.HTMLExporter().from_filename(str(NOTEBOOK))
     path = tmp_path / "notebook.html"
     path.write_text(text, encoding="utf-8")
-    with open_browser(1000, 900, "--host-resolver-rules=MAP * ~NOTFOUND") as driver:  # no network at all
+    no_network = "--host-resolver-rules=MAP * ~NOTFOUND"
+    with open_browser(no_network, width=1000, height=900) as driver:
         driver.get(path.as_uri())
         frame = wait_for(driver, "return document.querySelector('iframe')")
         driver.execute_script("arguments[0].scrollIntoView()", frame)

@@ -33,7 +33,8 @@ SPHERE = PhantomSettings(
 
 
 @pytest.fixture(scope="module")
-def ct(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def sphere_series(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a series of `SPHERE`, which is tilted."""
     folder = tmp_path_factory.mktemp("napari") / "ct"
     write_phantom(folder, SPHERE)
     return folder
@@ -44,7 +45,9 @@ def read_manifest() -> Any:
 
 
 def test_commands_of_the_manifest_are_functions_of_the_plugin() -> None:
-    for command in read_manifest().contributions.commands:
+    commands = read_manifest().contributions.commands
+    assert commands
+    for command in commands:
         module, _, name = command.python_name.partition(":")
         assert callable(getattr(import_module(module), name))
 
@@ -60,12 +63,12 @@ def test_manifest_names_the_files_that_the_reader_takes(tmp_path: Path) -> None:
     assert plugin.get_reader(["a.dcm", "b.dcm"]) is None
 
 
-def test_voxels_of_the_layer_of_a_tilted_scan_lie_where_the_scan_has_them(ct: Path) -> None:
-    volume = read_volume(ct)
-    reader = plugin.get_reader(str(ct))
+def test_voxels_of_the_layer_of_a_tilted_scan_lie_where_the_scan_has_them(sphere_series: Path) -> None:
+    volume = read_volume(sphere_series)
+    reader = plugin.get_reader(str(sphere_series))
     assert reader
 
-    [(voxels, attributes, kind)] = reader(str(ct))
+    [(voxels, attributes, kind)] = reader(str(sphere_series))
 
     assert kind == "image"
     assert np.array_equal(voxels, volume.voxels)
@@ -75,7 +78,8 @@ def test_voxels_of_the_layer_of_a_tilted_scan_lie_where_the_scan_has_them(ct: Pa
 
 
 def test_layer_of_a_mesh_has_its_vertices_with_the_axes_in_reverse(tmp_path: Path) -> None:
-    mesh = Mesh([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+    corners = [[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]]
+    mesh = Mesh(corners, triangles=[[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
     mesh.save(tmp_path / "m.ply")
     reader = plugin.get_reader(str(tmp_path / "m.ply"))
     assert reader
@@ -89,23 +93,23 @@ def test_layer_of_a_mesh_has_its_vertices_with_the_axes_in_reverse(tmp_path: Pat
 
 def test_surface_without_a_selected_scan_is_refused() -> None:
     viewer = SimpleNamespace(layers=SimpleNamespace(selection=[]))
-    with refused(UsageError, 0, "select"):
+    with refused(UsageError, 0, "select"):  # as many are selected
         plugin.add_surface(viewer)
 
 
 def test_surface_of_the_selected_scan_lies_on_it_in_napari(
-    device: Any, ct: Path, monkeypatch: pytest.MonkeyPatch
+    device: Any, sphere_series: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     components = pytest.importorskip("napari.components")
     layers = pytest.importorskip("napari.layers")
     monkeypatch.setenv("CLRECON_DEVICE", str(device.index))
     viewer = components.ViewerModel()
-    [(voxels, attributes, _)] = plugin.get_reader(str(ct))(str(ct))  # type: ignore[misc]
+    [(voxels, attributes, _)] = plugin.get_reader(str(sphere_series))(str(sphere_series))  # type: ignore[misc]
     viewer.add_layer(layers.Image(voxels, **attributes))
 
     plugin.add_surface(viewer)
 
     surface = viewer.layers[-1]
-    volume: Volume = read_volume(ct)
+    volume: Volume = read_volume(sphere_series)
     radii = np.linalg.norm(surface.data[0][:, ::-1] - volume.ijk_to_lps((np.array(volume.shape_ijk) - 1) / 2), axis=1)
     assert radii == pytest.approx(SPHERE.radius_mm, abs=1.0)  # the centre of the phantom is off by part of a voxel

@@ -22,8 +22,10 @@ from clrecon.viewer.notebook import _MOST_ROWS, _table
 
 VOLUME = Volume(np.arange(6 * 8 * 10, dtype=np.int16).reshape(6, 8, 10) * 4 - 900, np.diag([1.0, 1.0, 2.0, 1.0]))
 ENTRY = SeriesEntry(
-    2, "ab", "<b>thin</b>", "CT", 4, [6, 5, 4], [1.0, 1.0, 2.5], None, 0.0, 0.0, {"min": 1.0}, False, [], ["doubt"]
-)
+    number=2, uid_hash="ab", description="<b>thin</b>", modality="CT", slices=4, shape_ijk=[6, 5, 4],
+    spacing_mm=[1.0, 1.0, 2.5], affine_ijk_to_lps_mm=None, tilt_deg=0.0, grid_residual_max_mm=0.0,
+    gap_mm={"min": 1.0}, uneven=False, warnings=[], problems=["doubt"],
+)  # fmt: skip
 
 
 def find_addresses(text: str) -> list[str]:
@@ -43,7 +45,7 @@ def test_mesh_in_a_notebook_is_its_page_in_a_frame_that_may_run_scripts_alone():
 
 @pytest.mark.opencl
 def test_mesh_too_large_for_a_page_in_a_notebook_is_a_picture_with_a_hint(device):
-    vertices, triangles = samples.torus(1000, 240)
+    vertices, triangles = samples.torus(rings=1000, sides=240)
     vertices = vertices + np.random.default_rng(1).normal(0.0, 0.3, vertices.shape)  # which packs to 5 bytes a triangle
     shown = Mesh(vertices, triangles)._repr_html_()
     check = PageCheck(shown)
@@ -87,7 +89,7 @@ def test_label_map_in_a_notebook_is_a_table_of_names_voxels_and_ml():
 
 @pytest.mark.unit
 def test_listing_in_a_notebook_is_a_table_of_series_with_its_warnings_as_text():
-    shown = SeriesListing([ENTRY], 2, {}, ["one <warning>"])._repr_html_()
+    shown = SeriesListing([ENTRY], chosen=2, skipped={}, warnings=["one <warning>"])._repr_html_()
 
     ((_, row),) = PageCheck(shown).tables
     assert row == ["2", "<b>thin</b>", "CT", "4", "6 x 5 x 4", "1 x 1 x 2.5", "read by default", "doubt"]
@@ -96,6 +98,8 @@ def test_listing_in_a_notebook_is_a_table_of_series_with_its_warnings_as_text():
 
 @pytest.fixture
 def no_device(monkeypatch):
+    """No picture can be drawn."""
+
     def refuse(*_: object, **__: object) -> None:
         raise DeviceError("no device here")
 
@@ -106,7 +110,9 @@ def no_device(monkeypatch):
 @pytest.mark.unit
 @pytest.mark.usefixtures("no_device")
 @pytest.mark.parametrize(
-    "subject", [Mesh(*samples.torus(1000, 300)), PointCloud([[0, 0, 0], [1, 2, 3]])], ids=["large mesh", "cloud"]
+    "subject",
+    [Mesh(*samples.torus(rings=1000, sides=300)), PointCloud([[0, 0, 0], [1, 2, 3]])],
+    ids=["large mesh", "cloud"],
 )
 def test_picture_in_a_notebook_is_left_out_without_a_device(subject):
     assert subject._repr_html_() is None

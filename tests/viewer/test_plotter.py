@@ -33,12 +33,14 @@ HIDE = 'for f in $(ls {folders} 2>/dev/null); do mount --bind /dev/null $f || ex
 
 @pytest.fixture(scope="module")
 def display():
+    """The name of a screen."""
     with open_screen() as name:
         yield name
 
 
 @pytest.fixture(scope="module")
-def scan(shared_folder: Path, device) -> Path:
+def scan_of_balls(shared_folder: Path, device) -> Path:
+    """The file of a scan of three balls."""
     return make_once(shared_folder, "view_scan.nii.gz", lambda path: make_scan().save(path))
 
 
@@ -49,19 +51,19 @@ def shows_bone(seen: np.ndarray) -> bool:
 
 
 @pytest.mark.release
-def test_keys_and_slider_of_a_window_turn_clip_and_change_the_iso_value(display, scan, tmp_path):
-    with open_view(display, [scan, "--window", "--hu", f"{ISO:g}"], tmp_path) as window:
+def test_keys_and_slider_of_a_window_turn_clip_and_change_the_iso_value(display, scan_of_balls, tmp_path):
+    with open_view(display, [scan_of_balls, "--window", "--hu", f"{ISO:g}"], tmp_path) as window:
         before = window.wait(shows_bone, "the surface")
         assert before.shape[:2] == SIZE[::-1]
         window.key("2")
-        behind = window.wait_change(before, PICTURE, 0.01, "the scene from behind")
+        behind = window.wait_change(before, PICTURE, share=0.01, what="the scene from behind")
         window.key("c")
-        cut = window.wait_change(behind, PICTURE, 0.01, "a plane that clips")
+        cut = window.wait_change(behind, PICTURE, share=0.01, what="a plane that clips")
         window.key("c")
-        window.wait_change(cut, PICTURE, 0.01, "the whole scene")
+        window.wait_change(cut, PICTURE, share=0.01, what="the whole scene")
         start, end = ((0.25 + 0.5 * share) * SIZE[0] for share in (0.61, 0.9))  # 300 HU of -800 to 1000, and 820
         window.drag((start, 0.92 * SIZE[1]), (end, 0.92 * SIZE[1]))
-        window.wait_change(behind, PICTURE, 0.002, "smaller balls at a higher iso value")
+        window.wait_change(behind, PICTURE, share=0.002, what="smaller balls at a higher iso value")
         window.key("q")
         code, said, complained = window.finish()
     assert (code, said, "Traceback" in complained) == (0, "", False)
@@ -76,7 +78,7 @@ def test_distance_between_two_clicks_is_written_into_the_window(display, tmp_pat
         x, y = SIZE[0] / 2, SIZE[1] / 2
         window.click(x - 60, y)
         window.click(x + 60, y)
-        window.wait_change(before, (slice(0, 60), slice(700, 1100)), 0.001, "the distance in words")
+        window.wait_change(before, (slice(0, 60), slice(700, 1100)), share=0.001, what="the distance in words")
         window.key("q")
         assert window.finish()[0] == 0
 
@@ -196,7 +198,7 @@ def test_key_of_a_side_turns_the_view_to_it(scene, key, axis, sign):
     assert sign * away[axis] == pytest.approx(np.linalg.norm(away))
 
 
-def test_show_by_method_and_by_function_is_the_same_picture(monkeypatch):
+def test_method_show_calls_the_function_with_its_object_and_arguments(monkeypatch):
     asked: list[tuple[tuple[object, ...], dict[str, object]]] = []
     monkeypatch.setattr(clrecon, "show", lambda *shown, **given: asked.append((shown, given)), raising=False)
     volume, mesh = make_scan(), make_mesh()
@@ -208,6 +210,7 @@ def test_show_by_method_and_by_function_is_the_same_picture(monkeypatch):
 def run_refused_view(
     arguments: list[str | Path], folder: Path, environment: dict[str, str], *before: str
 ) -> tuple[int, str]:
+    """The exit code and the standard error of ``clrecon view --window``, run by the command `before`."""
     done = subprocess.run(
         [*before, sys.executable, "-m", "clrecon", "view", "--window", *map(str, arguments)],
         cwd=folder, env=environment, capture_output=True, text=True, timeout=60,
@@ -217,6 +220,7 @@ def run_refused_view(
 
 
 def check_refusal(found: tuple[int, str], words: str) -> None:
+    """Assert exit code 3 and one line with these words and the other ways to look at a scan."""
     code, complained = found
     assert code == 3
     assert words in complained and complained.count("\n") == 1

@@ -18,22 +18,26 @@ from clrecon.viewer import add_rendering, merge_scene
 pyvista = pytest.importorskip("pyvista")
 
 SIZE = (120, 90)
+RED, GREEN = (250, 40, 10), (0, 200, 0)
 
 
 @pytest.fixture(scope="module", autouse=True)
 def can_draw():
+    """Skip where nothing can be drawn off screen."""
     need_off_screen()
 
 
 @pytest.fixture
 def plotter():
+    """An empty scene of `SIZE`, off screen."""
     made = pyvista.Plotter(off_screen=True, window_size=SIZE)
     yield made
     made.close()
 
 
-def ball(camera: Camera, center=CENTRE, radius=RADIUS, color=(250, 40, 10)) -> Rendering:
-    return drawn_balls.ball(camera, SIZE, center, radius, color)
+def ball(camera: Camera, *, center=CENTRE, color=RED) -> Rendering:
+    """The picture of a ball of `RADIUS` mm."""
+    return drawn_balls.ball(camera, SIZE, center=center, radius=RADIUS, color=color)
 
 
 @pytest.mark.seconds
@@ -74,13 +78,13 @@ RIGHT, _, FORWARD = CAMERAS[0].basis()
 )
 def test_green_ball_of_a_mesh_and_red_one_of_a_picture_cover_each_other_as_in_space(plotter, center):
     mesh = pyvista.Sphere(radius=RADIUS, center=center, theta_resolution=120, phi_resolution=120)
-    plotter.add_mesh(mesh, color=(0, 200, 0), lighting=False)
-    red_ball, green_ball = ball(CAMERAS[0]), ball(CAMERAS[0], center, color=(0, 200, 0))
+    plotter.add_mesh(mesh, color=GREEN, lighting=False)
+    red_ball, green_ball = ball(CAMERAS[0]), ball(CAMERAS[0], center=center, color=GREEN)
 
     merged = merge_scene(plotter, red_ball)
 
     red, green = (np.nan_to_num(picture.depth, nan=np.inf) for picture in (red_ball, green_ball))
-    is_red, is_green = merged.image[..., 0] > 200, merged.image[..., 1] > 150
+    is_red, is_green = merged.image[..., 0] > 200, merged.image[..., 1] > 150  # of 250 and 200
     differs = (is_red != ((red < green) & np.isfinite(red))) | (is_green != (green < red))
     assert differs.mean() <= tolerances.DRAWN_OUTLINE_SHARE
     hit = np.isfinite(np.minimum(red, green)) & ~differs & (merged.image[..., 3] == 255)
@@ -92,13 +96,13 @@ def test_translucent_mesh_before_a_picture_keeps_its_colour_on_any_background(pl
     plotter.set_background(background)
     before = CENTRE - 50.0 * CAMERAS[0].basis().forward
     sheet = pyvista.Plane(center=before, direction=CAMERAS[0].basis().forward, i_size=500.0, j_size=500.0)
-    green, red, opacity = (0, 200, 0), (250, 40, 10), 0.4
-    plotter.add_mesh(sheet, color=green, opacity=opacity, lighting=False)
-    picture = ball(CAMERAS[0], color=red)
+    opacity = 0.4
+    plotter.add_mesh(sheet, color=GREEN, opacity=opacity, lighting=False)
+    picture = ball(CAMERAS[0], color=RED)
     made = merge_scene(plotter, picture)
     on_ball = np.isfinite(picture.depth)
-    assert np.abs(made.image[~on_ball] - np.array([*green, 255.0 * opacity])).max() <= tolerances.DRAWN_BLEND_LEVELS
-    both = opacity * np.array(green) + (1.0 - opacity) * np.array(red)
+    assert np.abs(made.image[~on_ball] - np.array([*GREEN, 255.0 * opacity])).max() <= tolerances.DRAWN_BLEND_LEVELS
+    both = opacity * np.array(GREEN) + (1.0 - opacity) * np.array(RED)
     assert np.abs(made.image[on_ball] - np.array([*both, 255.0])).max() <= tolerances.DRAWN_BLEND_LEVELS
     assert plotter.background_color == pyvista.Color(background)
 
@@ -124,4 +128,4 @@ def test_picture_is_not_merged_into_a_scene_of_another_size(plotter):
 
 def test_empty_picture_is_not_added_to_a_scene(plotter):
     with refused(UsageError, "hits", "nothing"):
-        add_rendering(plotter, ball(CAMERAS[0], CENTRE + 1000.0))
+        add_rendering(plotter, ball(CAMERAS[0], center=CENTRE + 1000.0))

@@ -27,6 +27,7 @@ SIZE = (96, 80)
 
 @pytest.fixture
 def open_model_and_painter(device):
+    """A function that makes the model and the painter of objects, by default of a scan of three balls."""
     with open_painters(device) as make:
         yield make
 
@@ -67,35 +68,23 @@ def in_strips_and_whole(request, open_model_and_painter, monkeypatch):
 
     model, painter = open_model_and_painter()
     model.set_mode(request.param)
-    model.turn(0.1, 0.05)
+    model.turn(dx=0.1, dy=0.05)
     in_strips = painter.picture(model.state, LARGE)
     monkeypatch.setattr(module, "take_strips", lambda take, camera, size: take(camera, size))
     return in_strips, painter.picture(model.state, LARGE)
 
 
-@pytest.mark.parametrize("in_strips_and_whole", ["surface", "mip", "slices"], indirect=True)
+@pytest.mark.parametrize("in_strips_and_whole", ["surface", "mip", "slices", "bone"], indirect=True)
 def test_large_picture_in_two_strips_is_that_in_one_piece(in_strips_and_whole):
     in_strips, whole = in_strips_and_whole
 
     assert in_strips.report["strips"] == 2
     assert in_strips.camera == whole.camera
     apart = np.abs(in_strips.image.astype(int) - whole.image.astype(int)).max(axis=2)
-    assert (apart > 3).mean() < 0.002  # of pixels, at edges: other rays in float32
+    assert (apart > 3).mean() < 0.002  # of pixels, at edges: other rays in float32; none was measured
     both = ~np.isnan(in_strips.depth) & ~np.isnan(whole.depth)
     assert both.any()
     assert np.median(np.abs(in_strips.depth[both] - whole.depth[both])) < 1e-3  # mm; 0 was measured
-
-
-@pytest.mark.parametrize("in_strips_and_whole", ["bone"], indirect=True)
-def test_large_volume_rendering_in_two_strips_is_nearly_that_in_one_piece(in_strips_and_whole):
-    in_strips, whole = in_strips_and_whole
-
-    assert in_strips.report["strips"] == 2
-    apart = np.abs(in_strips.image.astype(int) - whole.image.astype(int)).max(axis=2)
-    assert (apart > 3).mean() < 0.3  # of pixels, where random places of samples differ; none was measured
-    both = ~np.isnan(in_strips.depth) & ~np.isnan(whole.depth)
-    assert both.any()
-    assert np.median(np.abs(in_strips.depth[both] - whole.depth[both])) < 0.3  # mm: a step of the rays
 
 
 @pytest.mark.parametrize("in_strips_and_whole", ["drr"], indirect=True)
@@ -127,7 +116,7 @@ def test_picture_of_a_view_asks_twice_whether_it_is_cancelled_and_ends_where_it_
 
 def test_picture_of_a_view_that_shows_nothing_is_empty(open_model_and_painter):
     model, painter = open_model_and_painter()
-    model.show("1", False)
+    model.show("1", visible=False)
 
     picture = painter.picture(model.state, SIZE)
 
@@ -137,7 +126,7 @@ def test_picture_of_a_view_that_shows_nothing_is_empty(open_model_and_painter):
 
 def test_mesh_of_a_view_that_shows_nothing_is_refused(open_model_and_painter):
     model, painter = open_model_and_painter()
-    model.show("1", False)
+    model.show("1", visible=False)
     with refused(NoSurfaceError, "nothing"):
         painter.mesh_of_shown(model.state)
 
@@ -152,7 +141,7 @@ def test_picked_points_lie_on_the_surface_at_the_depth_of_their_pixels(open_mode
     picked = []
     for place in np.random.default_rng(3).choice(len(rows), 60, replace=False):
         row, column = rows[place], columns[place]
-        pick = painter.pick(model.state, SIZE, column + 0.5, row + 0.5)
+        pick = painter.pick(model.state, SIZE, x=column + 0.5, y=row + 0.5)
         assert (pick.object, pick.part) == (1, "1")
         at_its_depth = origins[row, column] + float(picture.depth[row, column]) * directions[row, column]
         assert pick.point == pytest.approx(at_its_depth, abs=0.02)  # mm: the way along a ray in float32
@@ -171,15 +160,15 @@ MIDDLE_OF_THE_MESH = scenes.middle(0) + (0.0, -25.0, 0.0)
 @pytest.mark.parametrize(("number", "point"), [(1, scenes.middle(2)), (2, MIDDLE_OF_THE_MESH)], ids=["scan", "mesh"])
 def test_pick_finds_the_nearest_object_in_each_projection(open_model_and_painter, perspective, number, point):
     model, painter = open_model_and_painter(scenes.make_scan(), scenes.make_mesh())
-    model.set_perspective(perspective)
+    model.set_perspective(on=perspective)
     x, y = model.camera.project([point], SIZE)[0][0]
-    pick = painter.pick(model.state, SIZE, x, y)
+    pick = painter.pick(model.state, SIZE, x=x, y=y)
     assert (pick.object, pick.part) == (number, str(number))
 
 
 def test_pick_beside_all_objects_finds_nothing(open_model_and_painter):
     model, painter = open_model_and_painter(scenes.make_scan(), scenes.make_mesh())
-    assert painter.pick(model.state, SIZE, 0.5, 0.5) is None
+    assert painter.pick(model.state, SIZE, x=0.5, y=0.5) is None
 
 
 def test_pick_of_a_cloud_is_one_of_its_points_without_hu(open_model_and_painter):
@@ -187,7 +176,7 @@ def test_pick_of_a_cloud_is_one_of_its_points_without_hu(open_model_and_painter)
     model, painter = open_model_and_painter(cloud)
     nearest = cloud.points[np.argmin(cloud.points[:, 1])]  # the view is from anterior
     pick = painter.pick(model.state, SIZE, *model.camera.project([nearest], SIZE)[0][0])
-    assert pick.point == pytest.approx(nearest, abs=0.2)
+    assert pick.point == pytest.approx(nearest, abs=1e-4)  # mm, in float32; measured 1e-6
     assert (pick.object, pick.hu) == (1, None)
 
 
@@ -228,10 +217,10 @@ def test_pick_in_a_slice_is_the_place_of_its_pixel_with_its_hu(open_model_and_pa
 
 def test_pick_in_a_turned_slice_lies_in_its_plane(open_model_and_painter):
     model, painter = open_model_and_painter()
-    model.turn_cross("sagittal", 30.0)
+    model.turn_cross("sagittal", degrees=30.0)
     forward = painter.slice_camera(model.state, "axial", SIZE).basis().forward
 
-    pick = painter.pick_slice(model.state, "axial", SIZE, 10.0, 15.0)
+    pick = painter.pick_slice(model.state, "axial", SIZE, x=10.0, y=15.0)
 
     assert abs(forward @ np.subtract(pick.point, model.state.cross)) < 1e-9  # mm, of places of some 200 mm
 
@@ -279,7 +268,7 @@ def test_clip_through_a_ball_leaves_a_closed_half_of_it_in_mesh_and_picture(open
     model.add_clip("left")
     (clip,) = model.state.clips
     middle_x = scenes.middle(0)[0]
-    model.move_clip(0, (middle_x - clip.low) / (clip.high - clip.low))
+    model.move_clip(0, share=(middle_x - clip.low) / (clip.high - clip.low))
 
     (mesh,) = painter.mesh_of_shown(model.state)
     picture = painter.picture(model.state, SIZE)
@@ -288,7 +277,7 @@ def test_clip_through_a_ball_leaves_a_closed_half_of_it_in_mesh_and_picture(open
     assert quality["closed"]
     assert mesh.bounds[1, 0] == pytest.approx(middle_x, abs=0.02)  # vertices in float32, held off samples
     half_ball_ml = 2 / 3 * np.pi * scenes.BALLS[0][1] ** 3 / 1000.0
-    assert quality["volume_ml"] == pytest.approx(half_ball_ml, rel=0.05)  # in voxels of about 1 mm
+    assert quality["volume_ml"] == pytest.approx(half_ball_ml, rel=0.035)  # voxels of about 1 mm; measured 0.983 of it
     drawn = render([(mesh, MeshLook())], camera=model.camera, size=SIZE, background="transparent", device=device)
     assert ((picture.image[..., 3] > 0) != (drawn.image[..., 3] > 0)).mean() < 0.005  # of pixels, at outlines
 
@@ -306,17 +295,18 @@ def test_oblique_clip_of_a_mesh_cuts_its_triangles_at_the_plane(open_model_and_p
 
 
 def test_large_mesh_is_drawn_with_fewer_triangles_while_it_moves(open_model_and_painter):
-    model, painter = open_model_and_painter(Mesh(*samples.torus(1000, 120)))
+    model, painter = open_model_and_painter(Mesh(*samples.torus(rings=1000, sides=120)))
     full = painter.picture(model.state, SIZE)
     painter.make_coarse()
     coarse = painter.picture(model.state, SIZE, sharp=False)
     assert COARSE_TRIANGLES / 2 < coarse.report["triangles"] <= COARSE_TRIANGLES < full.report["triangles"]
     assert np.array_equal(painter.picture(model.state, SIZE).image, full.image)
-    assert shown_pixels(coarse) == pytest.approx(shown_pixels(full), rel=0.2)
+    assert shown_pixels(coarse) == pytest.approx(shown_pixels(full), rel=0.01)  # measured equal
 
 
 @pytest.fixture
 def translucent_mesh(open_model_and_painter):
+    """The model and painter of a mesh with an opacity of 0.3."""
     model, painter = open_model_and_painter(scenes.make_mesh())
     model.set_opacity("1", 0.3)
     return model, painter
@@ -334,13 +324,13 @@ def test_picture_of_a_translucent_mesh_is_cancelled_between_its_layers(transluce
     asked = []
     with pytest.raises(Cancelled):
         painter.picture(model.state, SIZE, cancelled=lambda: bool(asked.append(1)) or len(asked) > 4)
-    assert len(asked) == 5
+    assert len(asked) == 5  # it goes on four times, and ends at the fifth
 
 
 def test_pick_of_a_translucent_mesh_is_on_its_front(translucent_mesh):
     model, painter = translucent_mesh
     middle_of_picture = SIZE[0] / 2, SIZE[1] / 2
-    in_front_of_its_middle = MIDDLE_OF_THE_MESH[1] - 3.0  # y grows to the back
+    in_front_of_its_middle = MIDDLE_OF_THE_MESH[1] - 3.0  # of a radius of 4 mm; y grows to the back
     assert painter.pick(model.state, SIZE, *middle_of_picture).point[1] < in_front_of_its_middle
 
 
@@ -378,7 +368,7 @@ def test_view_without_the_table_draws_the_scan_without_its_voxels(open_model_and
     before = shown_pixels(painter.picture(model.state, SIZE))
     assert not painter.knows_table
     assert painter.remove_table()[1]["dense_voxels_removed"] == 7 and painter.knows_table
-    model.set_table(False)
+    model.set_table(shown=False)
     assert 0 < shown_pixels(painter.picture(model.state, SIZE)) < before
     model.undo()
     assert shown_pixels(painter.picture(model.state, SIZE)) == before
@@ -389,7 +379,7 @@ def test_two_views_of_one_painter_draw_their_own_pictures_in_turn(open_model_and
     other = ViewModel(one.objects, iso_value=-200.0)
     find(one, painter)
     find(other, painter)
-    one.show("1/1", False)
+    one.show("1/1", visible=False)
     other.set_color("1/1", (0.0, 0.0, 1.0))
     pictures = [painter.picture(each.state, SIZE).image for each in (one, other)]
     for _ in range(2):
@@ -401,7 +391,8 @@ def test_two_views_of_one_painter_draw_their_own_pictures_in_turn(open_model_and
 def test_picture_of_a_scan_in_slabs_is_that_of_the_whole(device):
     objects = show_objects([scenes.make_scan()])
     model = ViewModel(objects, iso_value=scenes.ISO)
-    with Painter(objects, device=device) as whole, Painter(objects, device=device, memory=80_000) as slabs:
+    memory = 80_000  # bytes, of which the voxels alone would take 77,440
+    with Painter(objects, device=device) as whole, Painter(objects, device=device, memory=memory) as slabs:
         pictures = [each.picture(model.state, (24, 20)) for each in (whole, slabs)]
         assert pictures[1].report["slabs"] > 1
         assert np.array_equal(pictures[0].image, pictures[1].image)
@@ -421,8 +412,9 @@ def test_preparation_of_a_painter_builds_kernels_and_finds_parts(device):
 def test_coarse_mesh_has_few_triangles_near_the_fine_ones_and_their_area():
     from clrecon.viewer.drawing.stage import coarsen_mesh
 
-    fine = scenes.make_mesh(radius=20.0)
-    coarse, first = coarsen_mesh(fine, 500)
-    assert np.linalg.norm(coarse.vertices - fine.vertices[first], axis=1).max() < 8.0  # mm; cells of 4.5 mm
-    assert 200 < coarse.triangle_count < 1200  # of 500 that are asked for; 564 were measured
-    assert coarse.area == pytest.approx(fine.area, rel=0.1) and coarse.normals is not None
+    fine, wanted = scenes.make_mesh(radius=20.0), 500
+    coarse, first = coarsen_mesh(fine, triangles=wanted)
+    assert np.linalg.norm(coarse.vertices - fine.vertices[first], axis=1).max() < 4.5  # mm: a cell; measured 3.2
+    assert 250 < coarse.triangle_count < 1000  # half and twice of what is asked for; 564 were measured
+    assert coarse.area == pytest.approx(fine.area, rel=0.03)  # measured 0.986 of it
+    assert coarse.normals is not None

@@ -24,6 +24,7 @@ SCAN, MESH, LABELS = scenes.make_scan, scenes.make_mesh, scenes.make_labels
 
 
 def make_model(*subjects: Any) -> ViewModel:
+    """The model of a view of these objects, of a scan and a mesh by default."""
     return ViewModel(show_objects(subjects or [SCAN(), MESH()]))
 
 
@@ -34,8 +35,8 @@ def save(model: ViewModel) -> dict[str, Any]:
 
 def change_camera(model: ViewModel) -> None:
     model.look("left")
-    model.turn(0.1, 0.2)
-    model.set_perspective(True)
+    model.turn(dx=0.1, dy=0.2)
+    model.set_perspective(on=True)
 
 
 def add_measures(model: ViewModel) -> None:
@@ -53,24 +54,24 @@ def add_measures(model: ViewModel) -> None:
 
 def cut(model: ViewModel) -> None:
     model.add_clip("superior")
-    model.move_clip(0, 0.3)
+    model.move_clip(0, share=0.3)
     model.add_clip((1.0, 1.0, 0.0))
     model.flip_clip(1)
-    model.set_clip_box((-5.0, -5.0, -5.0), (5.0, 5.0, 5.0))
+    model.set_clip_box(low=(-5.0, -5.0, -5.0), high=(5.0, 5.0, 5.0))
 
 
 def move_slices(model: ViewModel) -> None:
     model.set_cross(scenes.middle(1))
-    model.frame_slice("coronal", 3.0, scenes.middle(1))
-    model.set_window(-100.0, 300.0)
-    model.turn_cross("axial", 30.0)
+    model.frame_slice("coronal", zoom=3.0, center=scenes.middle(1))
+    model.set_window(low=-100.0, high=300.0)
+    model.turn_cross("axial", degrees=30.0)
     model.set_slab(7.5, "max")
     model.set_layout("4")
 
 
 def show_projection(model: ViewModel) -> None:
     model.set_mode("mip")
-    model.set_window(0.0, 900.0, of="picture")
+    model.set_window(low=0.0, high=900.0, of="picture")
 
 
 def show_fit(model: ViewModel) -> None:
@@ -80,7 +81,7 @@ def show_fit(model: ViewModel) -> None:
 
 
 def change_looks(model: ViewModel) -> None:
-    model.show("1", False)
+    model.show("1", visible=False)
     model.set_color("2", (0.2, 0.4, 0.6))
     model.set_opacity("2", 0.5)
 
@@ -94,7 +95,7 @@ CHANGES = {
     "projection": show_projection,
     "fitted surface": show_fit,
     "looks of parts": change_looks,
-    "table": lambda model: model.set_table(False),
+    "table": lambda model: model.set_table(shown=False),
 }
 
 
@@ -111,7 +112,7 @@ def test_restored_view_is_the_saved_one(change: Any) -> None:
 def test_restored_labels_have_the_saved_colors() -> None:
     model, other = (make_model(SCAN(), LABELS()) for _ in range(2))
     model.set_color("2/1", (1.0, 0.0, 0.0))
-    model.show("2/2", False)
+    model.show("2/2", visible=False)
 
     restore_view(save(model), other)
 

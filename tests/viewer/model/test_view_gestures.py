@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from refusals import refused
@@ -10,22 +12,25 @@ from clrecon.errors import UsageError
 from clrecon.rendering.views.camera import Camera
 from clrecon.viewer.model.changes import pan_camera, pixel_camera, roll_camera, turn_camera, zoom_camera
 
-PARALLEL = Camera((10.0, -300.0, 40.0), (10.0, 20.0, 40.0), (0.0, 0.0, 1.0), parallel_scale=80.0)
-PERSPECTIVE = Camera((10.0, -300.0, 40.0), (10.0, 20.0, 40.0), (0.0, 0.0, 1.0), view_angle=30.0)
+FROM_THE_FRONT: Any = {"position": (10.0, -300.0, 40.0), "focal_point": (10.0, 20.0, 40.0), "up": (0.0, 0.0, 1.0)}
+PARALLEL = Camera(**FROM_THE_FRONT, parallel_scale=80.0)
+PERSPECTIVE = Camera(**FROM_THE_FRONT, view_angle=30.0)
 SIZE = (320, 200)
 BOTH = pytest.mark.parametrize("camera", [PARALLEL, PERSPECTIVE], ids=["parallel", "perspective"])
 pytestmark = pytest.mark.unit
 
 
 def pixel_of(camera: Camera, point) -> np.ndarray:
+    """Where a point is seen, (x, y) in pixels."""
     return camera.project([point], SIZE)[0][0]
 
 
 @BOTH
 def test_shift_of_the_camera_moves_a_place_with_the_pointer(camera):
     before = pixel_of(camera, camera.focal_point)
-    moved = pan_camera(camera, 0.25, -0.1)
-    assert pixel_of(moved, camera.focal_point) == pytest.approx(before + np.array([0.25, -0.1]) * SIZE[1])
+    moved = pan_camera(camera, dx=0.25, dy=-0.1)
+    height = SIZE[1]
+    assert pixel_of(moved, camera.focal_point) == pytest.approx(before + np.array([0.25, -0.1]) * height)
 
 
 @BOTH
@@ -36,7 +41,7 @@ def test_zoom_of_the_camera_keeps_the_place_under_the_pointer_and_scales_pixels(
     pixel = pixel_of(camera, place)
     pointer = (pixel - 0.5 * np.array(SIZE)) / SIZE[1]  # from the middle, in heights of the picture
 
-    zoomed = zoom_camera(camera, factor, tuple(pointer))
+    zoomed = zoom_camera(camera, factor, point=tuple(pointer))
 
     assert pixel_of(zoomed, place) == pytest.approx(pixel, abs=1e-6)
     assert zoomed.pixel_mm(SIZE) == pytest.approx(camera.pixel_mm(SIZE) / factor)
@@ -57,7 +62,7 @@ def test_zoom_of_the_camera_by_no_factor_above_0_is_refused(factor):
 
 @BOTH
 def test_turn_of_the_camera_by_the_height_of_the_picture_is_half_a_turn_at_its_distance(camera):
-    turned = turn_camera(camera, 1.0, 0.0)
+    turned = turn_camera(camera, dx=1.0, dy=0.0)
 
     assert turned.basis().forward == pytest.approx(-camera.basis().forward)
     assert turned.distance == pytest.approx(camera.distance)
@@ -68,7 +73,7 @@ def test_turn_of_the_camera_by_the_height_of_the_picture_is_half_a_turn_at_its_d
 def test_turn_of_the_camera_moves_the_front_of_an_object_with_the_pointer(camera, dx, dy):
     front = np.array(camera.focal_point) - 40.0 * camera.basis().forward
 
-    moved = pixel_of(turn_camera(camera, dx, dy), front) - pixel_of(camera, front)
+    moved = pixel_of(turn_camera(camera, dx=dx, dy=dy), front) - pixel_of(camera, front)
 
     along, across = (0, 1) if dx else (1, 0)
     assert moved[along] > 1.0  # pixels
@@ -77,7 +82,7 @@ def test_turn_of_the_camera_moves_the_front_of_an_object_with_the_pointer(camera
 
 @BOTH
 def test_turn_of_the_camera_and_back_is_where_it_was(camera):
-    back = turn_camera(turn_camera(camera, 0.3, 0.0), -0.3, 0.0)
+    back = turn_camera(turn_camera(camera, dx=0.3, dy=0.0), dx=-0.3, dy=0.0)
     assert back.position == pytest.approx(camera.position)
 
 
@@ -92,8 +97,8 @@ def test_roll_of_the_camera_turns_the_picture_clockwise(camera):
 @BOTH
 def test_camera_of_a_pixel_looks_along_its_ray(camera):
     origins, directions = camera.rays(SIZE)
-    for x, y in ((0, 0), (319, 199), (200, 30)):
-        one = pixel_camera(camera, SIZE, x + 0.5, y + 0.5)
+    for x, y in ((0, 0), (SIZE[0] - 1, SIZE[1] - 1), (200, 30)):
+        one = pixel_camera(camera, SIZE, x=x + 0.5, y=y + 0.5)
         origin, direction = (each[0, 0] for each in one.rays((1, 1)))
         assert origin == pytest.approx(origins[y, x], abs=1e-6)
         assert direction == pytest.approx(directions[y, x], abs=1e-9)

@@ -13,8 +13,8 @@ pytestmark = pytest.mark.unit
 
 
 @pytest.fixture
-def small_scan():
-    """A model of a scan of 3 x 4 x 5 voxels: i runs to the right, j to the back, k up."""
+def model_of_small_scan():
+    """Of 3 x 4 x 5 voxels, slices 2 mm apart: i runs to the right, j to the back, k up; its cross in (2, 1, 0)."""
     model = make_model(Volume(np.zeros((5, 4, 3), np.int16), np.diag([-1.0, 1.0, 2.0, 1.0])))
     model.set_cross((-2.0, 1.0, 0.0))
     return model
@@ -28,13 +28,13 @@ def small_scan():
         ("sagittal", {"place": "R 2.0 mm", "number": 3, "count": 3}),
     ],
 )
-def test_slice_has_its_place_and_its_number_of_all(small_scan, plane, facts):
-    assert small_scan.facts()["slices"][plane] == facts
+def test_slice_has_its_place_and_its_number_of_all(model_of_small_scan, plane, facts):
+    assert model_of_small_scan.facts()["slices"][plane] == facts
 
 
-def test_slice_that_is_scrolled_by_three_has_a_number_three_higher(small_scan):
-    small_scan.scroll("axial", 3)
-    assert small_scan.facts()["slices"]["axial"] == {"place": "S 6.0 mm", "number": 4, "count": 5}
+def test_slice_that_is_scrolled_by_three_has_a_number_three_higher(model_of_small_scan):
+    model_of_small_scan.scroll("axial", 3)
+    assert model_of_small_scan.facts()["slices"]["axial"] == {"place": "S 6.0 mm", "number": 4, "count": 5}
 
 
 def test_slice_without_a_scan_has_a_place_and_no_number():
@@ -43,7 +43,7 @@ def test_slice_without_a_scan_has_a_place_and_no_number():
 
 
 def test_slices_begin_in_the_middle_of_the_scan_whatever_lies_beside_it():
-    far = scenes.make_mesh(np.array([500.0, 0.0, 0.0]))
+    far = scenes.make_mesh(at=np.array([500.0, 0.0, 0.0]))
     cross = make_model(far, scenes.make_scan()).state.cross
     assert scenes.make_scan().lps_to_ijk(cross) == pytest.approx([22.0, 20.0, 11.0])  # of 44 x 40 x 22 voxels
 
@@ -93,8 +93,9 @@ def test_paging_an_oblique_scan_goes_to_the_middle_of_the_next_layer_at_the_cros
     scan = scenes.make_scan()
     model = make_model(scan)
     model.set_cross(scan.ijk_to_lps([22.0, 20.0, 11.3]))
-    for plane, axis, layers in (("axial", 2, [10.0, 11.0]), ("sagittal", 0, [21.0, 20.0])):
-        model.scroll(plane, -1 if plane == "axial" else 1)
+    steps = (("axial", 2, -1, [10.0, 11.0]), ("sagittal", 0, 1, [21.0, 20.0]))  # to the right, where i gets smaller
+    for plane, axis, first_step, layers in steps:
+        model.scroll(plane, first_step)
         first = scan.lps_to_ijk(model.state.cross)[axis]
         model.scroll(plane, 1)
         assert [first, scan.lps_to_ijk(model.state.cross)[axis]] == pytest.approx(layers), plane

@@ -26,7 +26,8 @@ from clrecon.viewer.model.state import ClipPlane, Pick, ShownPart
 pytestmark = pytest.mark.unit
 
 
-def make_parts(iso: float = 300.0) -> FoundParts:
+def make_parts(*, iso: float = 300.0) -> FoundParts:
+    """Parts 1/1, 1/2 and the rest 1/0 of the scan, as if they were found."""
     volume, labels = scenes.make_scan(), scenes.make_labels()
     parts = tuple(
         ShownPart(
@@ -35,30 +36,30 @@ def make_parts(iso: float = 300.0) -> FoundParts:
         )
         for n in (1, 2, 0)
     )  # fmt: skip
-    placed = ResampledLabels(labels.voxels, True, {}, ())
+    placed = ResampledLabels(labels.voxels, exact=True, inside={}, warnings=())
     return FoundParts(
         scan=1, iso_value=iso, table=True, volume=volume, labels=labels, placed=placed, parts=parts
     )  # fmt: skip
 
 
 CHANGES = {
-    "turn": lambda m: m.turn(0.1, 0.2),
-    "pan": lambda m: m.pan(0.1, 0.2),
-    "zoom": lambda m: m.zoom(2.0, (0.1, 0.1)),
+    "turn": lambda m: m.turn(dx=0.1, dy=0.2),
+    "pan": lambda m: m.pan(dx=0.1, dy=0.2),
+    "zoom": lambda m: m.zoom(2.0, at=(0.1, 0.1)),
     "roll": lambda m: m.roll(30.0),
     "look": lambda m: m.look("left"),
-    "perspective": lambda m: m.set_perspective(True),
+    "perspective": lambda m: m.set_perspective(on=True),
     "iso": lambda m: m.set_iso(310.0),
     "mode": lambda m: m.set_mode("muscle"),
-    "window": lambda m: m.set_window(-100.0, 300.0),
-    "table": lambda m: m.set_table(False),
+    "window": lambda m: m.set_window(low=-100.0, high=300.0),
+    "table": lambda m: m.set_table(shown=False),
     "scroll": lambda m: m.scroll("axial", 3),
     "cross": lambda m: m.set_cross((-40.0, -20.0, 210.0)),
-    "frame": lambda m: m.frame_slice("coronal", 2.0, (-40.0, -20.0, 210.0)),
-    "turn of the cross": lambda m: m.turn_cross("axial", 10.0),
+    "frame": lambda m: m.frame_slice("coronal", zoom=2.0, center=(-40.0, -20.0, 210.0)),
+    "turn of the cross": lambda m: m.turn_cross("axial", degrees=10.0),
     "slab": lambda m: m.set_slab(5.0, "max"),
     "layout": lambda m: m.set_layout("4"),
-    "hide": lambda m: m.show("1/1", False),
+    "hide": lambda m: m.show("1/1", visible=False),
     "only": lambda m: m.only("1/2"),
     "color": lambda m: m.set_color("2", (1.0, 0.5, 0.0)),
     "colors": lambda m: m.color_parts(),
@@ -67,7 +68,7 @@ CHANGES = {
     "measure": lambda m: m.add_seed(Pick(point=(1.0, 2.0, 3.0))),
     "clip": lambda m: m.add_clip("left"),
     "clip by the view": lambda m: m.add_clip("view"),
-    "box": lambda m: m.set_clip_box((-50.0, -40.0, 200.0), (-20.0, -20.0, 220.0)),
+    "box": lambda m: m.set_clip_box(low=(-50.0, -40.0, 200.0), high=(-20.0, -20.0, 220.0)),
 }
 
 
@@ -83,40 +84,40 @@ def test_each_change_raises_the_version_and_is_undone_in_one_step(change):
     assert model.undo() is None
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (lambda m: m.turn("a", 0.0), "a turn is a finite number"),
-        (lambda m: m.zoom(0.0), "above 0"),
-        (lambda m: m.look("lft"), "left"),
-        (lambda m: m.set_iso(9e9), "runs from -800 to 1000 HU"),
-        (lambda m: m.set_iso(float("nan")), "finite"),
-        (lambda m: m.set_mode("bones"), "bone"),
-        (lambda m: m.set_window(5.0, 5.0), "lower HU first"),
-        (lambda m: m.set_window(5.0, 9.0, "picture"), "has no window"),
-        (lambda m: m.set_window(5.0, 9.0, "page"), "slices"),
-        (lambda m: m.scroll("axal", 1), "axial"),
-        (lambda m: m.set_cross((1.0, 2.0)), "three finite numbers"),
-        (lambda m: m.turn_cross("axal", 1.0), "axial"),
-        (lambda m: m.turn_cross("axial", float("inf")), "finite"),
-        (lambda m: m.set_slab(-1.0), "0 to 100 mm"),
-        (lambda m: m.set_slab(5.0, "median"), "mean"),
-        (lambda m: m.set_layout("2"), "layout"),
-        (lambda m: m.frame_slice("axial", float("inf"), (0.0, 0.0, 0.0)), "finite"),
-        (lambda m: m.frame_slice("axial", 2.0, (0.0, 0.0)), "three finite numbers"),
-        (lambda m: m.show("7", True), "unknown part"),
-        (lambda m: m.set_color("2", (2.0, 0.0, 0.0)), "from 0 to 1"),
-        (lambda m: m.set_opacity("2", 1.5), "from 0 to 1"),
-        (lambda m: m.color_parts(), "not found yet"),
-        (lambda m: m.start_tool("ruler"), "distance"),
-        (lambda m: m.add_point(Pick(point=(0.0, 0.0, 0.0))), "no tool"),
-        (lambda m: m.add_clip("up"), "side of the patient"),
-        (lambda m: m.add_clip((0.0, 0.0, 0.0)), "length"),
-        (lambda m: m.move_clip(0, 0.5), "there are 0"),
-        (lambda m: m.set_clip_box((1.0, 0.0, 0.0), (0.0, 1.0, 1.0)), "holds nothing"),
-        (lambda m: m.set_clip_box((1.0, 0.0, 0.0), None), "two corners"),
-    ],
-)
+WRONG = {
+    "turn by a text": (lambda m: m.turn(dx="a", dy=0.0), "a turn is a finite number"),
+    "zoom by 0": (lambda m: m.zoom(0.0), "above 0"),
+    "unknown side": (lambda m: m.look("lft"), "left"),
+    "iso value beyond the scan": (lambda m: m.set_iso(9e9), "runs from -800 to 1000 HU"),
+    "iso value of NaN": (lambda m: m.set_iso(float("nan")), "finite"),
+    "unknown mode": (lambda m: m.set_mode("bones"), "bone"),
+    "window without width": (lambda m: m.set_window(low=5.0, high=5.0), "lower HU first"),
+    "window of a surface": (lambda m: m.set_window(low=5.0, high=9.0, of="picture"), "has no window"),
+    "window of no picture": (lambda m: m.set_window(low=5.0, high=9.0, of="page"), "slices"),
+    "scroll in no plane": (lambda m: m.scroll("axal", 1), "axial"),
+    "cross of two numbers": (lambda m: m.set_cross((1.0, 2.0)), "three finite numbers"),
+    "turn in no plane": (lambda m: m.turn_cross("axal", degrees=1.0), "axial"),
+    "endless turn": (lambda m: m.turn_cross("axial", degrees=float("inf")), "finite"),
+    "slab below 0": (lambda m: m.set_slab(-1.0), "0 to 100 mm"),
+    "slab of an unknown kind": (lambda m: m.set_slab(5.0, "median"), "mean"),
+    "unknown layout": (lambda m: m.set_layout("2"), "layout"),
+    "endless zoom of a slice": (lambda m: m.frame_slice("axial", zoom=float("inf"), center=(0.0, 0.0, 0.0)), "finite"),
+    "middle of two numbers": (lambda m: m.frame_slice("axial", zoom=2.0, center=(0.0, 0.0)), "three finite numbers"),
+    "unknown part": (lambda m: m.show("7", visible=True), "unknown part"),
+    "colour above 1": (lambda m: m.set_color("2", (2.0, 0.0, 0.0)), "from 0 to 1"),
+    "opacity above 1": (lambda m: m.set_opacity("2", 1.5), "from 0 to 1"),
+    "colours before parts are found": (lambda m: m.color_parts(), "not found yet"),
+    "unknown tool": (lambda m: m.start_tool("ruler"), "distance"),
+    "point without a tool": (lambda m: m.add_point(Pick(point=(0.0, 0.0, 0.0))), "no tool"),
+    "clip from no side": (lambda m: m.add_clip("up"), "side of the patient"),
+    "clip without a length": (lambda m: m.add_clip((0.0, 0.0, 0.0)), "length"),
+    "clip that is not there": (lambda m: m.move_clip(0, share=0.5), "there are 0"),
+    "box without room": (lambda m: m.set_clip_box(low=(1.0, 0.0, 0.0), high=(0.0, 1.0, 1.0)), "holds nothing"),
+    "box of one corner": (lambda m: m.set_clip_box(low=(1.0, 0.0, 0.0), high=None), "two corners"),
+}
+
+
+@pytest.mark.parametrize(("change", "words"), WRONG.values(), ids=WRONG)
 def test_wrong_value_is_refused_and_leaves_state_version_and_undo(change, words):
     model = make_model()
     before, version = model.state, model.version
@@ -126,31 +127,31 @@ def test_wrong_value_is_refused_and_leaves_state_version_and_undo(change, words)
 
 
 def test_moves_of_one_gesture_are_one_step_of_undo():
-    clock = iter([0.0, 0.1, 0.2, 5.0, 5.1])
+    clock = iter([0.0, 0.1, 0.2, 5.0, 5.1])  # seconds of three turns at once, and later one, and a shift
     model = ViewModel(show_objects([scenes.make_scan()]), clock=lambda: next(clock))
     first = model.state
     for _ in range(3):
-        model.turn(0.1, 0.0)
+        model.turn(dx=0.1, dy=0.0)
     later = model.state
-    model.turn(0.1, 0.0)
-    model.pan(0.1, 0.0)
+    model.turn(dx=0.1, dy=0.0)
+    model.pan(dx=0.1, dy=0.0)
     assert [model.undo() for _ in range(2)] == ["the shift", "the turn"] and model.state == later
     model.undo()
     assert model.state == first
 
 
 def test_a_slow_drag_is_one_step_of_undo_and_the_next_another():
-    clock = iter(range(0, 100, 10))
+    clock = iter(range(0, 100, 10))  # ten seconds between two moves
     model = ViewModel(show_objects([scenes.make_scan()]), clock=lambda: next(clock))
     states = [model.state]
     for _ in range(2):
-        model.hold(True)
-        model.pan(0.1, 0.0)
+        model.hold(on=True)
+        model.pan(dx=0.1, dy=0.0)
         model.zoom(1.1)
-        model.pan(0.1, 0.1)
-        model.hold(False)
+        model.pan(dx=0.1, dy=0.1)
+        model.hold(on=False)
         states.append(model.state)
-    model.pan(0.1, 0.0)
+    model.pan(dx=0.1, dy=0.0)
     assert model.undo() == "the shift" and model.state == states[2]
     assert model.undo() == "the shift" and model.state == states[1]
     assert model.undo() == "the shift" and model.state == states[0]
@@ -170,8 +171,7 @@ def test_facts_list_objects_and_parts_by_key():
 
 
 def test_facts_of_a_label_have_its_name_and_volume():
-    label = facts_of_all_kinds()["parts"][4]
-    assert label["name"] == "one"
+    [label] = [part for part in facts_of_all_kinds()["parts"] if part["name"] == "one"]
     voxel_ml = abs(np.linalg.det(scenes.AFFINE)) / 1000.0
     assert label["ml"] == pytest.approx(voxel_ml * np.count_nonzero(scenes.make_labels().voxels == 1), abs=0.001)
 
@@ -186,7 +186,8 @@ def test_facts_name_the_sides_and_the_cross_in_the_frame_of_the_output():
 
 def test_facts_hold_the_modes_and_the_range_of_the_level():
     facts = facts_of_all_kinds()
-    assert facts["iso"] == {"hu": 200.0, "low": -800.0, "high": 1000.0}
+    low, high = scenes.make_scan().hu_range
+    assert facts["iso"] == {"hu": 200.0, "low": low, "high": high}  # a view begins at 200 HU
     assert {"surface", "bone", "mip", "minip", "drr", "slices", "labels"} <= {each["name"] for each in facts["modes"]}
 
 
@@ -208,7 +209,9 @@ def test_view_of_labels_alone_is_in_its_one_mode():
     assert model.state.mode == "labels"
 
 
-@pytest.mark.parametrize("change", [lambda m: m.set_iso(200.0), lambda m: m.set_table(False)], ids=["iso", "table"])
+@pytest.mark.parametrize(
+    "change", [lambda m: m.set_iso(200.0), lambda m: m.set_table(shown=False)], ids=["iso value", "table"]
+)
 def test_change_of_a_scan_in_a_view_without_one_is_refused(change):
     with refused(UsageError, "scan"):
         change(make_model(scenes.make_mesh()))
@@ -258,7 +261,7 @@ def test_a_flipped_clip_plane_keeps_the_other_side(clipped):
 
 def test_a_clip_plane_moved_to_the_end_keeps_everything(clipped):
     model, right_and_left = clipped
-    model.move_clip(0, 1.0)
+    model.move_clip(0, share=1.0)
     assert model.state.clip.contains(right_and_left).all()
 
 
@@ -268,14 +271,14 @@ def test_a_removed_clip_plane_is_gone(clipped):
     assert model.state.clip is None and model.state.clips == ()
 
 
-def test_window_of_a_view_follows_from_its_parts_when_they_are_found():
+def test_parts_that_are_found_raise_the_version_and_are_no_step_of_undo():
     model = make_model()
     version = model.version
 
     model.take_parts([make_parts()])
 
     assert model.version == version + 1
-    assert model.state.window == (-450.0, 1050.0)
+    assert model.undo() is None
 
 
 def test_view_from_a_side_fits_the_parts_that_are_shown():
@@ -291,7 +294,7 @@ def test_view_from_a_side_fits_the_parts_that_are_shown():
     model.only("1/1")
     model.look("anterior")
 
-    assert model.camera.parallel_scale < 0.5 * of_all  # half of 5 mm and a margin, 2.55, of 21.8
+    assert model.camera.parallel_scale < 0.2 * of_all  # half of 5 mm and a margin, 2.55, of 21.8
     assert model.camera.focal_point == pytest.approx((-47.5, -27.5, 207.5))  # the middle of the box
 
 
@@ -319,12 +322,12 @@ def test_all_parts_are_shown_again_together(three_parts):
 
 def test_looks_of_parts_go_over_to_another_iso_value_by_their_place():
     model = make_model(scenes.make_scan())
-    model.take_parts([make_parts(300.0)])
-    model.show("1/2", False)
+    model.take_parts([make_parts(iso=300.0)])
+    model.show("1/2", visible=False)
     model.set_color("1/1", (1.0, 0.0, 0.0))
     model.set_iso(310.0)
     assert not model.parts_known
-    fresh = make_parts(310.0)
+    fresh = make_parts(iso=310.0)
     swapped = {1: 2, 2: 1, 0: 0}
     voxels = np.array([0, 2, 1], np.uint8)[fresh.labels.voxels]
     labels = type(fresh.labels)(voxels, fresh.labels.affine.copy())
@@ -364,7 +367,7 @@ def test_perspective_camera_shows_the_focal_plane_as_large_as_the_parallel_one()
     model = make_model()
     parallel = model.state.camera
 
-    model.set_perspective(True)
+    model.set_perspective(on=True)
 
     perspective = model.state.camera
     assert perspective.view_angle == 30.0
@@ -375,8 +378,8 @@ def test_perspective_camera_shows_the_focal_plane_as_large_as_the_parallel_one()
 def test_camera_that_is_parallel_again_has_its_scale():
     model = make_model()
     before = model.state.camera.parallel_scale
-    model.set_perspective(True)
-    model.set_perspective(False)
+    model.set_perspective(on=True)
+    model.set_perspective(on=False)
     assert model.state.camera.parallel_scale == pytest.approx(before)
 
 
@@ -388,7 +391,7 @@ def pick_in_middle(sliced, number):
         _sliced=lambda state: sliced, _number_at=lambda scan, labelled, point: number,
     )  # fmt: skip
     state = SimpleNamespace(part=lambda key: SimpleNamespace(object=7))
-    return Painter.pick_slice(painter, state, "axial", (40, 30), 20.0, 15.0), camera
+    return Painter.pick_slice(painter, state, "axial", (40, 30), x=20.0, y=15.0), camera
 
 
 @pytest.mark.parametrize(("number", "key", "number_of_object"), [(2, "1/2", 7), (3, None, None)], ids=["part", "none"])
@@ -412,9 +415,10 @@ CLOUD_OF_3 = PointCloud(np.ones((3, 3)), hu=np.array([3.0, 4.0, 5.0]))
 
 
 def cloud_of_shown(*clouds, hidden=None):
+    """The points that a view of clouds saves, one of which may be hidden by its key."""
     model = make_model(*clouds)
     if hidden:
-        model.show(hidden, False)
+        model.show(hidden, visible=False)
     return shown_cloud(SimpleNamespace(objects=show_objects(clouds)), model.state)
 
 
@@ -440,5 +444,6 @@ def test_progress_of_the_search_for_parts_names_each_step(monkeypatch):
 
     monkeypatch.setattr(parts.Mask, "from_band", find_nothing)
     told = []
-    parts.find_clusters(SimpleNamespace(volume=scenes.make_scan()), 1, 300.0, True, lambda *step: told.append(step))
+    resident = SimpleNamespace(volume=scenes.make_scan())
+    parts.find_clusters(resident, scan=1, iso_value=300.0, table=True, progress=lambda *step: told.append(step))
     assert told == [("parts", done, parts.STEPS) for done in range(parts.STEPS + 1)]

@@ -24,7 +24,7 @@ def test_straight_slices_look_up_back_and_to_the_right_of_the_patient() -> None:
 
 
 def test_quarter_turn_on_the_axial_slice_turns_the_two_others_clockwise_and_leaves_it() -> None:
-    turn = turn_cross(None, "axial", 90.0)
+    turn = turn_cross(None, "axial", degrees=90.0)
 
     looks = [find_forward(plane, turn) for plane in ("axial", "coronal", "sagittal")]
 
@@ -43,17 +43,17 @@ def test_turned_slices_stay_across_each_other_after_a_thousand_turns() -> None:
 
 
 def test_slice_on_which_the_cross_is_turned_stays_as_it_is() -> None:
-    camera = find_plane(scenes.make_scan(), "sagittal", (200, 100))
+    camera = find_plane(scenes.make_scan(), "sagittal", size=(200, 100))
 
-    turned = turn_plane(camera, turn_cross(None, "sagittal", 35.0))
+    turned = turn_plane(camera, turn_cross(None, "sagittal", degrees=35.0))
 
     assert np.allclose(np.array(turned.basis()), np.array(camera.basis()), rtol=0, atol=ROUNDING)
 
 
 @pytest.mark.parametrize("degrees", [20.0, 90.0])  # beyond 72 degrees little of the upward direction lies in the slice
 def test_turned_slice_is_seen_along_its_direction_from_as_far_away(degrees: float) -> None:
-    camera = find_plane(scenes.make_scan(), "coronal", (200, 100))
-    turn = turn_cross(None, "sagittal", degrees)
+    camera = find_plane(scenes.make_scan(), "coronal", size=(200, 100))
+    turn = turn_cross(None, "sagittal", degrees=degrees)
 
     turned = turn_plane(camera, turn)
 
@@ -64,7 +64,7 @@ def test_turned_slice_is_seen_along_its_direction_from_as_far_away(degrees: floa
 def test_turned_slice_says_its_angle_in_place_of_its_number() -> None:
     model = make_model()
 
-    model.turn_cross("sagittal", -20.0)
+    model.turn_cross("sagittal", degrees=-20.0)
 
     shown = model.facts()["slices"]
     assert shown["axial"]["place"] == shown["coronal"]["place"] == "turned 20.0°"
@@ -74,7 +74,7 @@ def test_turned_slice_says_its_angle_in_place_of_its_number() -> None:
 
 def test_scrolling_a_turned_slice_goes_along_its_direction() -> None:
     model = make_model()
-    model.turn_cross("coronal", 30.0)
+    model.turn_cross("coronal", degrees=30.0)
     before = np.array(model.state.cross)
 
     model.scroll("axial", 2)
@@ -88,7 +88,7 @@ def test_scrolling_a_turned_slice_goes_along_its_direction() -> None:
 
 def test_straightened_slices_lie_along_the_axes_of_the_patient() -> None:
     model = make_model()
-    model.turn_cross("axial", 30.0)
+    model.turn_cross("axial", degrees=30.0)
 
     model.straighten()
 

@@ -32,6 +32,7 @@ def voxel_places(volume: Volume) -> np.ndarray:
 
 
 def check_values(measure, values: np.ndarray) -> None:
+    """Assert that a measure is of these HU, by their number, mean and deviation."""
     assert measure.voxels == len(values) > 20  # or the test would see little
     assert measure.value == pytest.approx(values.mean(), abs=1e-3)  # as it is rounded
     assert measure.sd == pytest.approx(values.std(ddof=1), abs=1e-3)
@@ -39,7 +40,8 @@ def check_values(measure, values: np.ndarray) -> None:
 
 def test_circle_takes_the_voxels_of_its_layer_whose_centres_lie_within_its_radius() -> None:
     volume = make_noise(np.diag([0.7, 0.9, 2.0, 1.0]))
-    points = place_region("circle", (6.1, 7.2, 8.9), (10.0, 7.2, 8.9), X, -Y)  # 8.9 mm: nearest to layer 4
+    centre, rim = (6.1, 7.2, 8.9), (10.0, 7.2, 8.9)  # 8.9 mm: nearest to layer 4
+    points = place_region("circle", centre, rim, right=X, up=-Y)
 
     measure = measure_region(volume, "circle", points)
 
@@ -51,29 +53,29 @@ def test_circle_takes_the_voxels_of_its_layer_whose_centres_lie_within_its_radiu
 
 def test_box_takes_the_voxels_of_its_layer_within_its_corners() -> None:
     volume = make_noise(np.diag([0.7, 0.9, 2.0, 1.0]))
-    points = place_region("box", (2.0, 3.0, 8.0), (9.0, 10.0, 8.0), X, -Y)
+    points = place_region("box", first=(2.0, 3.0, 8.0), second=(9.0, 10.0, 8.0), right=X, up=-Y)
 
     measure = measure_region(volume, "box", points)
 
     check_values(measure, volume.voxels[4, 4:12, 3:13].ravel().astype(float))  # y 3.6 to 9.9 mm, x 2.1 to 8.4 mm
-    assert measure.area_mm2 == pytest.approx(49.0)
+    assert measure.area_mm2 == pytest.approx((9.0 - 2.0) * (10.0 - 3.0))
 
 
 @pytest.mark.parametrize("z", [8.999999, 9.0, 9.000001])
 def test_region_between_two_layers_takes_one_of_them(z: float) -> None:
     volume = make_noise(np.diag([1.0, 1.0, 2.0, 1.0]))
-    points = place_region("box", (2.0, 3.0, z), (9.0, 10.0, z), X, -Y)
+    points = place_region("box", first=(2.0, 3.0, z), second=(9.0, 10.0, z), right=X, up=-Y)
 
-    assert measure_region(volume, "box", points).voxels == 8 * 8
+    assert measure_region(volume, "box", points).voxels == 8 * 8  # 1 mm apart, 2 to 9 and 3 to 10 mm
 
 
 @pytest.mark.parametrize("thickness", [3.0, 7.5])
 def test_region_on_an_oblique_thick_slice_takes_all_voxels_within_its_thickness(thickness: float) -> None:
     volume = make_noise(scenes.AFFINE)
     middle = volume.ijk_to_lps([8.3, 7.1, 6.4])
-    right, up = (np.array(turn_cross(None, "axial", 25.0)) @ np.array(turn_cross(None, "sagittal", 35.0)) @ (X, Y)[n]
-                 for n in (0, 1))  # fmt: skip
-    points = place_region("circle", tuple(middle), tuple(middle + 4.5 * right), right, up)
+    turns = (turn_cross(None, "axial", degrees=25.0), turn_cross(None, "sagittal", degrees=35.0))
+    right, up = (np.array(turns[0]) @ np.array(turns[1]) @ axis for axis in (X, Y))
+    points = place_region("circle", tuple(middle), tuple(middle + 4.5 * right), right=right, up=up)
 
     measure = measure_region(volume, "circle", points, thickness_mm=thickness)
 
@@ -86,8 +88,9 @@ def test_region_on_an_oblique_thick_slice_takes_all_voxels_within_its_thickness(
 def test_thin_region_on_an_oblique_slice_takes_one_voxel_of_each_column_through_it() -> None:
     volume = make_noise(np.diag([1.0, 1.0, 1.0, 1.0]))
     middle = np.array([8.0, 8.0, 7.0])
-    right, up = (np.array(turn_cross(None, "sagittal", 20.0)) @ axis for axis in (X, Y))
-    points = place_region("box", tuple(middle - 5.2 * (right + up)), tuple(middle + 5.2 * (right + up)), right, up)
+    right, up = (np.array(turn_cross(None, "sagittal", degrees=20.0)) @ axis for axis in (X, Y))
+    half = 5.2 * (right + up)
+    points = place_region("box", tuple(middle - half), tuple(middle + half), right=right, up=up)
 
     measure = measure_region(volume, "box", points)
 
@@ -105,7 +108,8 @@ def test_region_in_an_uneven_stack_takes_the_layer_that_lies_nearest() -> None:
     heights = np.cumsum([0.0, 1, 1, 1, 1, 4, 4, 1, 1, 1, 1, 1, 1, 1])
     positions = np.stack([np.zeros(14), np.zeros(14), heights], axis=1)
     volume = make_noise(np.eye(4), slice_positions=positions)
-    points = place_region("box", (2.0, 3.0, 9.5), (9.0, 10.0, 9.5), X, -Y)  # layers at 8 and 12 mm
+    z = 9.5  # mm, between layers at 8 and 12 mm
+    points = place_region("box", first=(2.0, 3.0, z), second=(9.0, 10.0, z), right=X, up=-Y)
 
     measure = measure_region(volume, "box", points)
 
@@ -113,6 +117,7 @@ def test_region_in_an_uneven_stack_takes_the_layer_that_lies_nearest() -> None:
 
 
 def draw(model, tool: str, first, second, axes=(X, -Y)):
+    """Click at two points of a slice, `axes` to its right and up; return the measure."""
     model.start_tool(tool)
     model.add_point(Pick(point=tuple(first)), axes)
     return model.add_point(Pick(point=tuple(second)), axes)

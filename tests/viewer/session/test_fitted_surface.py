@@ -34,11 +34,12 @@ Measured 13.55.
 
 
 def shell_of_bone() -> Volume:
-    return hollow_ball(RADIUS_MM, THICKNESS_MM)
+    return hollow_ball(radius=RADIUS_MM, thickness=THICKNESS_MM)
 
 
 @pytest.fixture
-def session(device):
+def open_session(device):
+    """A function that opens the session of objects, by default of a scan of three balls and a mesh."""
     with open_sessions(device) as make:
         yield make
 
@@ -58,9 +59,9 @@ def do(view: ViewSession, command: str, **arguments: Any) -> dict[str, Any]:
     return view.facts()
 
 
-def picture(view: ViewSession, moving: bool = False) -> Rendering:
+def picture(view: ViewSession, *, moving: bool = False) -> Rendering:
     taken: list[Rendering] = []
-    view.picture(SIZE, moving, taken.append)
+    view.picture(SIZE, moving=moving, then=taken.append)
     assert view.wait(PATIENCE) and view.facts()["error"] is None
     return taken[-1]
 
@@ -72,8 +73,8 @@ def picked_radius(view: ViewSession) -> float:
     return float(np.linalg.norm(np.subtract(pick["point"], MIDDLE)))
 
 
-def test_the_fit_is_announced_and_lies_on_the_bone(session) -> None:
-    view = session(shell_of_bone())
+def test_a_fit_is_announced_lies_on_the_bone_and_is_taken_back(open_session) -> None:
+    view = open_session(shell_of_bone())
     assert picked_radius(view) > AT_ISO_MM
     assert "fitting the surface to the bone" in view.do({"do": "toggle_fitted"})["busy"]
     assert view.wait(PATIENCE)
@@ -91,8 +92,8 @@ def test_a_view_asked_for_the_surface_of_the_cortex_begins_with_it(device, tmp_p
         assert view.facts()["fitted"] is True and view.facts()["error"] is None
 
 
-def test_a_surface_is_fitted_once_for_each_iso_value(session) -> None:
-    view = session(shell_of_bone())
+def test_a_surface_is_fitted_once_for_each_iso_value(open_session) -> None:
+    view = open_session(shell_of_bone())
     do(view, "set_fitted", shown=True)
     first = view.painter.find_fits(view.model.state)
     key = view.picture_key("scene")
@@ -102,19 +103,19 @@ def test_a_surface_is_fitted_once_for_each_iso_value(session) -> None:
     assert view.picture_key("scene") == key and view.painter.find_fits(view.model.state) == first
 
 
-def test_a_scan_without_walls_of_bone_stays_at_the_iso_value(session) -> None:
-    view = session(hollow_ball(cortex=260.0, inner=260.0))
+def test_a_scan_without_walls_of_bone_stays_at_the_iso_value(open_session) -> None:
+    view = open_session(hollow_ball(cortex=260.0, inner=260.0))
     do(view, "set_iso", hu=150)
     facts = do(view, "set_fitted", shown=True)
     assert facts["fitted"] is False and "scan 1 at 150 HU is not fitted to the bone" in facts["error"]
     assert "no walls of bone" in facts["error"] and view.facts()["busy"] == []
 
 
-def test_a_fit_is_refused_where_no_surface_is_shown(session) -> None:
-    view = session(scenes.make_mesh())
+def test_a_fit_is_refused_where_no_surface_is_shown(open_session) -> None:
+    view = open_session(scenes.make_mesh())
     with refused(UsageError, "scan", "HU"):
         view.do({"do": "set_fitted", "shown": True})
-    view = session(scenes.make_scan())
+    view = open_session(scenes.make_scan())
     with refused(UsageError, "thickness", "fitted"):
         view.do({"do": "set_color_by", "name": "thickness"})
     do(view, "set_mode", name="drr")
@@ -123,8 +124,8 @@ def test_a_fit_is_refused_where_no_surface_is_shown(session) -> None:
     assert view.facts()["fitted"] is None
 
 
-def test_a_fit_under_way_is_given_up_by_the_same_key(session, monkeypatch) -> None:
-    view = session(shell_of_bone())
+def test_a_fit_under_way_is_given_up_by_the_same_key(open_session, monkeypatch) -> None:
+    view = open_session(shell_of_bone())
 
     def fit_for_ever(state: Any, progress: Any) -> None:
         while True:
@@ -137,8 +138,8 @@ def test_a_fit_under_way_is_given_up_by_the_same_key(session, monkeypatch) -> No
     assert view.facts()["fitted"] is False and view.facts()["error"] is None
 
 
-def test_colours_show_numbers_by_one_scale(session) -> None:
-    view = session(shell_of_bone())
+def test_colours_of_a_fitted_surface_go_from_thickness_to_error_to_none_each_with_its_scale(open_session) -> None:
+    view = open_session(shell_of_bone())
     do(view, "set_fitted", shown=True)
     plain = picture(view).image
     assert view.facts()["scale"] is None
@@ -147,16 +148,14 @@ def test_colours_show_numbers_by_one_scale(session) -> None:
     lightest_yellow = [255, 255, 178]  # of the scale YlOrRd
     assert len(scale["colors"]) > 32 and scale["colors"][0] == lightest_yellow  # 64 steps
     for moving in (True, False):
-        assert np.abs(picture(view, moving).image[..., :3].astype(int)).max() > 100  # of 255: something is shown
+        assert np.abs(picture(view, moving=moving).image[..., :3].astype(int)).max() > 100  # of 255: something is shown
     assert np.abs(picture(view).image.astype(int) - plain).max() > 50  # of 255: in other colours; measured 151
     assert do(view, "step_color_by")["scale"]["title"] == "mm of error"
     assert do(view, "step_color_by")["color_by"] is None
-    with refused(UsageError, "hardness", "thickness"):
-        view.do({"do": "set_color_by", "name": "hardness"})
 
 
-def test_parts_of_a_fitted_surface_are_hidden_picked_and_translucent(session, two_balls: Volume) -> None:
-    view = session(two_balls)
+def test_parts_of_a_fitted_surface_are_hidden_picked_and_translucent(open_session, two_balls: Volume) -> None:
+    view = open_session(two_balls)
     do(view, "set_fitted", shown=True)
     both, one_key = shown_pixels(picture(view)), "1/1"
     do(view, "show", key=one_key, visible=False)
@@ -170,8 +169,8 @@ def test_parts_of_a_fitted_surface_are_hidden_picked_and_translucent(session, tw
     assert image[round(y), round(x), 3] == pytest.approx(255 * (1.0 - 0.7**4), abs=40)  # of two walls with two faces
 
 
-def test_what_is_saved_is_the_fitted_surface_with_its_numbers_and_scale(session, tmp_path: Path) -> None:
-    view = session(shell_of_bone())
+def test_what_is_saved_is_the_fitted_surface_with_its_numbers_and_scale(open_session, tmp_path: Path) -> None:
+    view = open_session(shell_of_bone())
     do(view, "set_fitted", shown=True)
     do(view, "set_color_by", name="thickness")
     width, height = 200, 200

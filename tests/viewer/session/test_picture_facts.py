@@ -17,16 +17,16 @@ from clrecon.viewer.model.state import VIEWS, picture_key
 
 pytestmark = pytest.mark.unit
 
-CAMERA = Camera((0.0, -100.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), parallel_scale=50.0)
+CAMERA = Camera(position=(0.0, -100.0, 0.0), focal_point=(0.0, 0.0, 0.0), up=(0.0, 0.0, 1.0), parallel_scale=50.0)
 SIZE = (100, 100)
 
 
-def picture_of_wall(left: int, right: int, mm: float) -> Rendering:
-    """A picture of a wall over some columns, this far from the eye."""
+def picture_of_wall(*, columns: tuple[int, int] = (0, SIZE[0]), mm: float) -> Rendering:
+    """A picture of a wall from the first to before the last of `columns`, by default over all, `mm` from the eye."""
     depth = np.full(SIZE[::-1], np.nan, np.float32)
-    depth[:, left:right] = mm
+    depth[:, slice(*columns)] = mm
     image = np.zeros((*SIZE[::-1], 4), np.uint8)
-    return Rendering(image, depth, depth, CAMERA, None, "surface", {})
+    return Rendering(image, depth, expected_depth=depth, camera=CAMERA, mode="surface", report={})
 
 
 def lengths_mm(pieces: list[list[list[float]]]) -> list[float]:
@@ -46,22 +46,23 @@ LINE_OF_80_MM = np.array([[-40.0, 0.0, 0.0], [40.0, 0.0, 0.0]])
     ],
 )
 def test_line_is_hidden_behind_a_wall_and_seen_beside_and_before_it(columns, wall_mm, seen_mm):
-    pieces = seen_pieces(picture_of_wall(*columns, wall_mm), [LINE_OF_80_MM], expected=False)
+    pieces = seen_pieces(picture_of_wall(columns=columns, mm=wall_mm), [LINE_OF_80_MM], expected=False)
     assert lengths_mm(pieces) == pytest.approx(seen_mm, abs=1.5)  # pixels at its ends
 
 
 def test_line_on_a_surface_and_line_beside_the_picture_are_seen():
-    on, beside = np.array([[-40.0, 0, 0], [40.0, 0, 0]]), np.array([[100.0, 0, 0], [200.0, 0, 0]])
-    assert len(seen_pieces(picture_of_wall(0, 100, 100.0), [on, beside], expected=True)) == 2
+    beside = np.array([[100.0, 0, 0], [200.0, 0, 0]])
+    assert len(seen_pieces(picture_of_wall(mm=100.0), [LINE_OF_80_MM, beside], expected=True)) == 2
 
 
-@pytest.mark.parametrize(("behind", "count"), [(2.4, 1), (2.6, 0)])
-def test_line_up_to_half_a_mm_and_two_pixels_behind_a_wall_is_seen(behind, count):
-    line = np.array([[-40.0, 0, 0], [40.0, 0, 0]])
-    assert len(seen_pieces(picture_of_wall(0, 100, 100.0 - behind), [line], expected=False)) == count
+@pytest.mark.parametrize(("behind_mm", "count"), [(2.4, 1), (2.6, 0)])
+def test_line_up_to_half_a_mm_and_two_pixels_behind_a_wall_is_seen(behind_mm, count):
+    wall = picture_of_wall(mm=100.0 - behind_mm)
+    assert len(seen_pieces(wall, [LINE_OF_80_MM], expected=False)) == count
 
 
 def changed_views(**changes: object) -> set[str]:
+    """The views whose pictures are stale after changes of the state of a view."""
     state = ViewModel(show_objects([scenes.make_scan(), scenes.make_mesh()])).state
     made = replace(state, **changes)
     return {view for view in VIEWS if picture_key(state, view) != picture_key(made, view)}

@@ -11,19 +11,22 @@ from open_views import open_sessions
 pytestmark = pytest.mark.opencl
 
 PATIENCE = 60.0
+MEMORY = 80_000
+"""Bytes, of which the voxels of the scan alone would take 77,440."""
 
 
 @pytest.fixture
 def open_session(device):
+    """A function that opens the session of objects, by default of a scan of three balls and a mesh."""
     with open_sessions(device) as make:
         yield make
 
 
 def test_scan_that_is_drawn_in_slabs_is_warned_of_as_slow(open_session):
-    view = open_session(scenes.make_scan(), memory=80_000)
+    view = open_session(scenes.make_scan(), memory=MEMORY)
     pictures: list[Any] = []
 
-    view.picture((24, 20), False, pictures.append)
+    view.picture((24, 20), moving=False, then=pictures.append)
 
     assert view.wait(PATIENCE)
     assert len(pictures) == 1
@@ -31,11 +34,11 @@ def test_scan_that_is_drawn_in_slabs_is_warned_of_as_slow(open_session):
     assert any("in slabs, which is slow" in text for text in view.facts()["warnings"])
 
 
-@pytest.mark.parametrize(("memory", "has_thumbnails"), [(None, True), (80_000, False)], ids=["whole", "slabs"])
+@pytest.mark.parametrize(("memory", "has_thumbnails"), [(None, True), (MEMORY, False)], ids=["whole", "slabs"])
 def test_thumbnails_are_drawn_of_each_mode_but_not_of_a_scan_in_slabs(open_session, memory, has_thumbnails):
     view = open_session(scenes.make_scan(), memory=memory)
     thumbnails: dict[str, Any] = {}
-    view.picture((24, 20), False, lambda picture: None)
+    view.picture((24, 20), moving=False, then=lambda picture: None)
     assert view.wait(PATIENCE)
 
     view.draw_modes(thumbnails.__setitem__)

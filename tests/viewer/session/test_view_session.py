@@ -17,6 +17,7 @@ from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry import Volume
 from clrecon.viewer.drawing.painter import Painter
 from clrecon.viewer.model.objects import ShownMesh, show_objects
+from clrecon.viewer.model.state import MOST_ZOOM
 from clrecon.viewer.session.commands import COMMANDS
 from clrecon.viewer.session.session import ViewSession
 
@@ -27,6 +28,7 @@ AT = {"size": list(SIZE)}
 
 @pytest.fixture
 def open_session(device):
+    """A function that opens the session of objects, by default of a scan of three balls and a mesh."""
     with open_sessions(device) as make:
         yield make
 
@@ -37,10 +39,10 @@ def pixel(session: ViewSession, number: int) -> dict:
     return {"x": float(x), "y": float(y), **AT}
 
 
-def wait_for_picture(session: ViewSession, moving: bool = False):
+def wait_for_picture(session: ViewSession, *, moving: bool = False):
     """Return the next picture of the scene."""
     found: list[Any] = []
-    session.picture(SIZE, moving, found.append)
+    session.picture(SIZE, moving=moving, then=found.append)
     assert session.wait(PATIENCE)
     assert session.facts()["error"] is None
     return found[-1]
@@ -177,6 +179,7 @@ def test_each_command_is_done_and_what_it_changes_is_undone(open_session):
         ({"do": "save", "path": "page.doc"}, "extension"),
         ({"do": "save", "path": ""}, "extension"),
     ],
+    ids=lambda value: repr(value)[:60],
 )
 def test_wrong_command_is_refused_and_leaves_state_and_version(open_session, command, words):
     view = open_session()
@@ -190,7 +193,7 @@ def test_wrong_command_is_refused_and_leaves_state_and_version(open_session, com
 def test_pictures_and_slices_of_a_session_are_drawn_by_its_thread_with_their_timing(open_session):
     view = open_session()
     names = []
-    view.picture(SIZE, False, lambda made: names.append((threading.current_thread().name, made.size)))
+    view.picture(SIZE, moving=False, then=lambda made: names.append((threading.current_thread().name, made.size)))
     for plane in ("axial", "coronal", "sagittal"):
         view.slice(plane, (50, 40), lambda made: names.append((threading.current_thread().name, made.size)))
     assert view.wait(PATIENCE)
@@ -201,7 +204,9 @@ def test_pictures_and_slices_of_a_session_are_drawn_by_its_thread_with_their_tim
 
 
 @pytest.mark.opencl
-@pytest.mark.parametrize(("took_ms", "size"), [(1.0, SIZE), (1e9, (77, 64))], ids=["fast", "slow"])
+@pytest.mark.parametrize(
+    ("took_ms", "size"), [(1.0, SIZE), (1e9, (77, 64))], ids=["fast", "slow"]
+)  # 64 pixels at least
 def test_coarse_picture_is_smaller_after_one_that_took_long(open_session, monkeypatch, took_ms, size):
     view = open_session(scenes.make_scan())
     paint = view.painter.picture
@@ -356,12 +361,12 @@ def test_session_that_is_closed_while_it_works_ends_its_threads(open_session, mo
 
     monkeypatch.setattr(view.painter, "find_parts", search_for_ever)
     view.do({"do": "find_parts"})
-    view.picture((600, 600), False, lambda made: None)
+    view.picture((600, 600), moving=False, then=lambda made: None)
     while "finding parts" not in view.facts()["busy"]:
         time.sleep(0.001)
     view.close()
     assert not view._work._thread.is_alive() and not view._pictures._thread.is_alive()
-    view.picture(SIZE, False, lambda made: pytest.fail("a closed view draws nothing"))
+    view.picture(SIZE, moving=False, then=lambda made: pytest.fail("a closed view draws nothing"))
     view.close()
 
 
@@ -384,13 +389,13 @@ def test_sessions_of_one_painter_draw_their_own_pictures_in_turn(device):
         views = [ViewSession(objects, painter, iso_value=iso) for iso in (300.0, 0.0, 700.0)]
         try:
             for view in views:
-                wait_for_picture(view)  # the view knows the size of its wait_for_picture now
+                wait_for_picture(view)  # the view knows the size of its picture now
                 view.do({"do": "look", "view": "left"})
             alone = [wait_for_picture(view).image for view in views]
             for view in views:
                 for _ in range(4):
                     view.do({"do": "turn", "dx": 0.05, "dy": 0.02})
-                    view.picture(SIZE, True, lambda made: None)
+                    view.picture(SIZE, moving=True, then=lambda made: None)
                 view.do({"do": "look", "view": "left"})
             for view, before in zip(views, alone, strict=True):
                 assert np.array_equal(wait_for_picture(view).image, before)
@@ -415,14 +420,15 @@ def test_mesh_of_more_than_two_million_triangles_is_warned_of_as_slow():
 
 @pytest.mark.opencl
 def test_picture_too_large_for_the_allowed_memory_is_an_error(open_session):
-    view = open_session(scenes.make_scan(), memory=80_000)
+    memory = 80_000
+    view = open_session(scenes.make_scan(), memory=memory)
     pictures: list[Any] = []
 
-    view.picture((800, 800), False, pictures.append)
+    view.picture((800, 800), moving=False, then=pictures.append)
 
     assert view.wait(PATIENCE)
     assert pictures == []
-    assert "80,000 bytes are allowed" in view.facts()["error"]
+    assert f"{memory:,} bytes are allowed" in view.facts()["error"]
 
 
 @pytest.mark.opencl
@@ -431,7 +437,7 @@ def test_first_picture_of_a_view_is_fitted_to_its_size_without_a_step_of_undo(op
     before = view.model.camera.parallel_scale
     pictures: list[Any] = []
 
-    view.picture((200, 80), False, pictures.append)  # wide
+    view.picture((200, 80), moving=False, then=pictures.append)  # wide
 
     assert view.wait(PATIENCE)
     assert pictures[0].camera.parallel_scale < before
@@ -442,12 +448,12 @@ def test_first_picture_of_a_view_is_fitted_to_its_size_without_a_step_of_undo(op
 def test_camera_that_was_changed_is_not_fitted_to_another_size(open_session):
     view = open_session()
     pictures: list[Any] = []
-    view.picture((200, 80), False, pictures.append)
+    view.picture((200, 80), moving=False, then=pictures.append)
     assert view.wait(PATIENCE)
     view.do({"do": "zoom", "factor": 2})
     zoomed = view.model.camera
 
-    view.picture((80, 80), False, pictures.append)
+    view.picture((80, 80), moving=False, then=pictures.append)
 
     assert view.wait(PATIENCE)
     assert pictures[1].camera == zoomed
@@ -463,12 +469,15 @@ def test_work_in_the_background_tells_of_its_changes(open_session):
     assert len(told) >= 4  # begin and end of three works, and the parts: measured 7
 
 
-def place_in_slice(view: ViewSession, x: float, y: float) -> list[float]:
+def place_in_slice(view: ViewSession, pixel: tuple[float, float]) -> list[float]:
+    """What lies at a pixel (x, y) of the coronal slice, LPS mm."""
+    x, y = pixel
     return view.do({"do": "pick", "x": x, "y": y, "plane": "coronal", **AT})["pick"]["point"]
 
 
 POINTER, MIDDLE = (70.0, 20.0), (48.0, 40.0)
 """Pixels (x, y) of a slice of 96 x 80."""
+HEIGHT = float(SIZE[1])
 FACTS_MM = 2e-3
 """Of places in facts, which have three decimals."""
 
@@ -476,43 +485,45 @@ FACTS_MM = 2e-3
 @pytest.mark.opencl
 def test_slice_is_zoomed_about_what_is_under_the_pointer(open_session):
     view = open_session()
-    at_pointer, in_middle = place_in_slice(view, *POINTER), place_in_slice(view, *MIDDLE)
-    about = [(POINTER[0] - MIDDLE[0]) / 80.0, (POINTER[1] - MIDDLE[1]) / 80.0]  # in heights, from the middle
+    at_pointer, in_middle = place_in_slice(view, POINTER), place_in_slice(view, MIDDLE)
+    about = [(POINTER[0] - MIDDLE[0]) / HEIGHT, (POINTER[1] - MIDDLE[1]) / HEIGHT]  # from the middle
 
     for factor in (2.0, 1.5):
         view.do({"do": "zoom_slice", "plane": "coronal", "factor": factor, "about": about, **AT})
 
-    assert place_in_slice(view, *POINTER) == pytest.approx(at_pointer, abs=FACTS_MM)
-    away = np.subtract(place_in_slice(view, *MIDDLE), at_pointer)
+    assert place_in_slice(view, POINTER) == pytest.approx(at_pointer, abs=FACTS_MM)
+    away = np.subtract(place_in_slice(view, MIDDLE), at_pointer)
     assert away == pytest.approx(np.subtract(in_middle, at_pointer) / (2.0 * 1.5), abs=FACTS_MM)
 
 
 @pytest.mark.opencl
 def test_slice_that_was_zoomed_is_fitted_again_by_a_command(open_session):
     view = open_session()
-    in_middle = place_in_slice(view, *MIDDLE)
+    in_middle = place_in_slice(view, MIDDLE)
     view.do({"do": "zoom_slice", "plane": "coronal", "factor": 2.0, "about": [0.3, -0.2], **AT})
 
     view.do({"do": "fit_slices"})
 
-    assert place_in_slice(view, *MIDDLE) == pytest.approx(in_middle, abs=FACTS_MM)
+    assert place_in_slice(view, MIDDLE) == pytest.approx(in_middle, abs=FACTS_MM)
 
 
 @pytest.mark.opencl
 @pytest.mark.parametrize("factor", [3.0, 0.6])
 def test_slice_of_a_thin_stack_is_zoomed_about_the_pointer_beside_it(open_session, factor):
     view = open_session(Volume(np.zeros((3, 60, 60), np.int16), np.diag([3.0, 3.0, 5.0, 1.0])))
-    before = place_in_slice(view, 64.0, 32.0)
+    pointer = (MIDDLE[0] + 0.2 * HEIGHT, MIDDLE[1] - 0.1 * HEIGHT)
+    before = place_in_slice(view, pointer)
     assert before[2] > 2.5 * 5.0  # beside the stack, whose third slice of 5 mm ends there
     view.do({"do": "zoom_slice", "plane": "coronal", "factor": factor, "about": [0.2, -0.1], **AT})
-    assert place_in_slice(view, 64.0, 32.0) == pytest.approx(before, abs=2e-3)
+    assert place_in_slice(view, pointer) == pytest.approx(before, abs=FACTS_MM)
 
 
 @pytest.mark.opencl
 def test_slice_that_is_shifted_far_stays_at_the_border_of_the_picture(open_session):
     view = open_session(Volume(np.zeros((3, 60, 60), np.int16), np.diag([3.0, 3.0, 5.0, 1.0])))
     view.do({"do": "pan_slice", "plane": "coronal", "dx": 0, "dy": 1000, **AT})
-    assert place_in_slice(view, 48.0, 80.0)[2] == pytest.approx(12.5)
+    lowest_in_the_middle = (MIDDLE[0], HEIGHT)
+    assert place_in_slice(view, lowest_in_the_middle)[2] == pytest.approx(2.5 * 5.0)  # where its third slice ends
 
 
 @pytest.mark.opencl
@@ -539,15 +550,16 @@ def test_probe_at_the_end_of_a_scan_is_inside_of_it(open_session, end):
 def test_slice_is_shifted_by_shares_of_its_height(open_session):
     view = open_session()
     view.do({"do": "zoom_slice", "plane": "coronal", "factor": 3.0, **AT})
-    before = place_in_slice(view, 48.0, 40.0)
+    before = place_in_slice(view, MIDDLE)
     view.do({"do": "pan_slice", "plane": "coronal", "dx": 0.1, "dy": 0.05, **AT})
-    assert place_in_slice(view, 56.0, 44.0) == pytest.approx(before, abs=2e-3)
+    shifted = (MIDDLE[0] + 0.1 * HEIGHT, MIDDLE[1] + 0.05 * HEIGHT)
+    assert place_in_slice(view, shifted) == pytest.approx(before, abs=FACTS_MM)
 
 
 @pytest.mark.opencl
 def test_zoom_of_a_slice_beyond_the_largest_leaves_it(open_session):
     view = open_session()
-    view.do({"do": "zoom_slice", "plane": "axial", "factor": 40.0, **AT})
+    view.do({"do": "zoom_slice", "plane": "axial", "factor": 0.8 * MOST_ZOOM, **AT})
     before = view.model.state
     view.do({"do": "zoom_slice", "plane": "axial", "factor": 2.0, "about": [0.2, 0.2], **AT})
     assert view.model.state == before

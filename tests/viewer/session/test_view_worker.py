@@ -15,6 +15,7 @@ pytestmark = pytest.mark.unit
 
 @pytest.fixture
 def worker():
+    """A worker, with the errors that it told in `errors`."""
     errors: list[tuple[str, str]] = []
     made = Worker("test", lambda kind, words: errors.append((kind, words)))
     made.errors = errors  # type: ignore[attr-defined]

@@ -19,8 +19,8 @@ def test_secret_is_long_and_never_the_same() -> None:
 
 @pytest.mark.parametrize("host", ["127.0.0.1:8000", "localhost:1", "LOCALHOST:65535", "[::1]:80", "127.0.0.1"])
 def test_request_of_this_machine_is_let_in(host: str) -> None:
-    assert refuse_request(host, None, SECRET, SECRET) is None
-    assert refuse_request(host, f"http://{host}", SECRET, SECRET, by_page=True) is None
+    assert refuse_request(host, origin=None, given=SECRET, secret=SECRET) is None
+    assert refuse_request(host, origin=f"http://{host}", given=SECRET, secret=SECRET, by_page=True) is None
 
 
 @pytest.mark.parametrize(
@@ -31,7 +31,7 @@ def test_request_of_this_machine_is_let_in(host: str) -> None:
     ],
 )  # fmt: skip
 def test_foreign_host_is_refused(host: str | None) -> None:
-    assert "127.0.0.1 and localhost alone" in refuse_request(host, None, SECRET, SECRET)
+    assert "127.0.0.1 and localhost alone" in refuse_request(host, origin=None, given=SECRET, secret=SECRET)
 
 
 @pytest.mark.parametrize(
@@ -42,16 +42,17 @@ def test_foreign_host_is_refused(host: str | None) -> None:
     ],
 )  # fmt: skip
 def test_foreign_origin_is_refused_with_the_right_secret(origin: str) -> None:
-    assert "another server" in refuse_request("127.0.0.1:8000", origin, SECRET, SECRET)
+    assert "another server" in refuse_request("127.0.0.1:8000", origin, given=SECRET, secret=SECRET)
 
 
 def test_request_that_only_pages_make_needs_an_origin() -> None:
-    assert refuse_request("127.0.0.1:8000", None, SECRET, SECRET) is None
-    assert "another server" in refuse_request("127.0.0.1:8000", None, SECRET, SECRET, by_page=True)
+    without_origin = {"host": "127.0.0.1:8000", "origin": None, "given": SECRET, "secret": SECRET}
+    assert refuse_request(**without_origin) is None
+    assert "another server" in refuse_request(**without_origin, by_page=True)
 
 
 @pytest.mark.parametrize("given", [None, "", SECRET[:-1], SECRET + "x", SECRET.swapcase(), "é", "\udcff"])
 def test_wrong_secret_is_refused_in_a_line_that_does_not_hold_it(given: str | None) -> None:
-    said = refuse_request("127.0.0.1:8000", None, given, SECRET)
+    said = refuse_request("127.0.0.1:8000", origin=None, given=given, secret=SECRET)
     assert said.startswith("refused: the secret is missing or wrong")
     assert SECRET not in said and "\n" not in said

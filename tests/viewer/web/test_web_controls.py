@@ -92,6 +92,7 @@ OF_OTHER_TESTS = {"another", "pickfiles"}
 
 @pytest.fixture(scope="module")
 def page(view_browser, view_server):
+    """The page of a scan of three balls and a mesh, once its parts are found, with the cross in the largest ball."""
     with open_view_page(view_browser, view_server) as opened:
         run_command(opened, "find_parts")
         wait_for(opened, "return clrecon.facts.parts_known && !clrecon.facts.busy.length")

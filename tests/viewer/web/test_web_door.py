@@ -20,11 +20,13 @@ pytestmark = pytest.mark.unit
 
 @pytest.fixture
 def views() -> Views:
+    """Views of a scan by a painter that paints the iso value, and the sessions that were opened."""
     return Views()
 
 
 @pytest.fixture
 def served(views: Views):
+    """A server of these views."""
     with serving(views.open) as running:
         yield running
 
@@ -32,14 +34,15 @@ def served(views: Views):
 @pytest.mark.parametrize("method", ["HEAD", "POST"])
 @pytest.mark.parametrize("path", ["/?secret={}", "/saved/x?secret={}"], ids=["page", "file"])
 def test_method_other_than_get_is_not_allowed(served: WebServer, path: str, method: str) -> None:
-    status, _, _ = get_path(served, path.format(secret_of(served)), method)
+    status, _, _ = get_path(served, path.format(secret_of(served)), method=method)
 
     assert status == 405
 
 
 @pytest.fixture
 def page_headers(served: WebServer) -> dict[str, str]:
-    return get_path(served, f"/?secret={secret_of(served)}")[1]
+    _, headers, _ = get_path(served, f"/?secret={secret_of(served)}")
+    return headers
 
 
 def test_page_is_sent_without_the_secret_and_sets_no_cookie(served: WebServer) -> None:
@@ -118,10 +121,9 @@ def test_socket_without_an_origin_is_refused_and_opens_no_session(served: WebSer
 
 
 def test_page_behind_a_tunnel_may_have_another_port(served: WebServer) -> None:
-    assert (
-        get_path(served, f"/?secret={secret_of(served)}", Host="localhost:9999", Origin="http://localhost:9999")[0]
-        == 200
-    )
+    other_port = {"Host": "localhost:9999", "Origin": "http://localhost:9999"}
+    status, _, _ = get_path(served, f"/?secret={secret_of(served)}", **other_port)
+    assert status == 200
 
 
 @pytest.mark.parametrize("path", ["/nothing", "/../etc/passwd", "/saved/", "/saved/wrong"])

@@ -37,6 +37,7 @@ ISO = scenes.ISO
 
 @pytest.fixture
 def page(view_browser, view_server):
+    """The page of a scan of three balls, whose surface is at `ISO`, and a mesh."""
     with open_view_page(view_browser, view_server) as opened:
         yield opened
 
@@ -45,7 +46,7 @@ def page(view_browser, view_server):
 
 
 def drag_scene_to_the_right(page) -> None:
-    drag(page, page.find_element("id", "scene"), 0, 0, 150, 30)  # pixels, from the middle
+    drag(page, page.find_element("id", "scene"), dx=150, dy=30)
 
 
 def test_drag_turns_the_picture_and_leaves_the_slices(page) -> None:
@@ -112,7 +113,7 @@ def test_number_key_shows_a_side_with_the_letters_of_its_edges(page, key: str, u
 
 def drag_slider_of_the_iso_value(page) -> float:
     """Drag the slider to the right, and return the new iso value."""
-    drag(page, page.find_element("id", "hu"), 0, 0, 150, 0)
+    drag(page, page.find_element("id", "hu"), dx=150, dy=0)
     wait_until_drawn(page)
     return facts(page)["iso"]["hu"]
 
@@ -181,7 +182,7 @@ def test_wheel_over_the_slider_steps_it_and_the_iso_value_up(page) -> None:
 
     slider = page.find_element("id", "hu")
 
-    ActionChains(page).scroll_from_origin(ScrollOrigin.from_element(slider), 0, -100).perform()
+    ActionChains(page).scroll_from_origin(ScrollOrigin.from_element(slider), delta_x=0, delta_y=-100).perform()
 
     wait_for(page, f"return clrecon.facts.iso.hu === {ISO + HU_OF_ONE_STEP}")
     assert slider.get_attribute("value") == f"{ISO + HU_OF_ONE_STEP:g}"
@@ -279,7 +280,7 @@ def test_wheel_moves_a_slice_along_its_own_axis_alone(page) -> None:
     x, y, z = facts(page)["cross"]
     axial = page.find_element("id", "axial")
 
-    ActionChains(page).scroll_from_origin(ScrollOrigin.from_element(axial), 0, 300).perform()
+    ActionChains(page).scroll_from_origin(ScrollOrigin.from_element(axial), delta_x=0, delta_y=300).perform()
 
     wait_for(page, f"return clrecon.facts.cross[2] !== {z}")
     assert facts(page)["cross"][:2] == pytest.approx([x, y])

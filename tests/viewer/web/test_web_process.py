@@ -39,6 +39,7 @@ run()
 
 @pytest.fixture(scope="module")
 def scan(tmp_path_factory) -> Path:
+    """The file of a scan of three balls."""
     path = tmp_path_factory.mktemp("view") / "scan.nii.gz"
     write_volume(scenes.make_scan(), path)
     return path

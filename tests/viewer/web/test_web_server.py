@@ -26,11 +26,13 @@ JPEG_GREYS = 2  # what a flat grey changes by in a picture for the browser
 
 @pytest.fixture
 def views() -> Views:
+    """Views of a scan by a painter that paints the iso value, and the sessions that were opened."""
     return Views()
 
 
 @pytest.fixture
 def served(views: Views):
+    """A server of these views."""
     with serving(views.open) as running:
         yield running
 
@@ -96,7 +98,7 @@ def test_colours_of_a_fitted_surface_come_with_their_scale_and_a_picture(served:
             await client.until(lambda: client.facts["scale"] is not None and len(client.pictures) > before)
             return client.facts["scale"]
 
-    assert asyncio.run(browse())["ticks"] == [0.0, 0.5, 1.0, 1.5, 2.0]
+    assert asyncio.run(browse())["ticks"] == [0.0, 0.5, 1.0, 1.5, 2.0]  # the painter of web_views ends it at 2 mm
 
 
 def test_unknown_quantity_of_a_fitted_surface_is_said(served: WebServer) -> None:

@@ -125,8 +125,9 @@ def zoom_axial_by_the_wheel(page) -> None:
     from selenium.webdriver.common.actions.wheel_input import ScrollOrigin
     from selenium.webdriver.common.keys import Keys
 
-    origin = ScrollOrigin.from_element(page.find_element("id", "axial"), 30, 10)
-    ActionChains(page).key_down(Keys.CONTROL).scroll_from_origin(origin, 0, -400).key_up(Keys.CONTROL).perform()
+    origin = ScrollOrigin.from_element(page.find_element("id", "axial"), x_offset=30, y_offset=10)
+    actions = ActionChains(page).key_down(Keys.CONTROL).scroll_from_origin(origin, delta_x=0, delta_y=-400)
+    actions.key_up(Keys.CONTROL).perform()
     wait_for_zoom(page, "axial")
 
 

@@ -64,6 +64,7 @@ class Dropper:
 
 @pytest.fixture
 def open_room() -> Iterator[Any]:
+    """A function that opens the start page of a server, in the end closed."""
     rooms = []
 
     def make(limits: Limits = Limits(), settings: ViewSettings | None = None) -> StartRoom:  # noqa: B008
@@ -77,13 +78,15 @@ def open_room() -> Iterator[Any]:
 
 @pytest.fixture
 def dropper(open_room) -> Iterator[Dropper]:
-    room = open_room(SMALL)
+    """A browser at the start page of a server that takes three files of 1000 bytes in all."""
+    room = open_room(limits=SMALL)
     with serving(room.open_session, start=room) as server:
         yield Dropper(server, room)
 
 
 @pytest.fixture
 def large_dropper(open_room) -> Iterator[Dropper]:
+    """A browser at the start page of a server with the usual limits."""
     room = open_room()
     with serving(room.open_session, start=room) as server:
         yield Dropper(server, room)
@@ -207,7 +210,7 @@ def test_dropped_files_are_removed_when_the_server_ends(open_room) -> None:
 
 
 def test_series_is_listed_with_its_size_and_a_picture(large_dropper: Dropper, tmp_path: Path) -> None:
-    write_series(tmp_path / "CT", Plan(shape=(7, 30, 40)))
+    write_series(tmp_path / "CT", Plan(shape=(7, 30, 40), pixel_spacing=(0.7, 0.5), gap=1.25))
 
     (choice,) = large_dropper.drop(tmp_path / "CT")
 

@@ -30,6 +30,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.opencl]
 
 @pytest.fixture
 def page(view_browser, view_server):
+    """The page of a scan of three balls and a mesh."""
     with open_view_page(view_browser, view_server) as opened:
         yield opened
 
@@ -203,7 +204,7 @@ def test_escape_stops_the_search_for_parts(page_with_parts, monkeypatch) -> None
 # Distances
 
 
-def measure_distance(page, first: int, second: int) -> tuple[np.ndarray, np.ndarray, str]:
+def measure_distance(page, *, first: int, second: int) -> tuple[np.ndarray, np.ndarray, str]:
     """Measure by clicks on the middles of two balls, and return the two points and the text."""
     page.find_element("id", "distance").click()
     click_point(page, "scene", scenes.middle(first))
@@ -217,7 +218,7 @@ def measure_distance(page, first: int, second: int) -> tuple[np.ndarray, np.ndar
 
 @pytest.mark.release
 def test_clicks_of_a_distance_meet_the_balls_that_they_point_at(page) -> None:
-    first, second, _ = measure_distance(page, 1, 2)
+    first, second, _ = measure_distance(page, first=1, second=2)
 
     from_middles = [np.linalg.norm(first - scenes.middle(1)), np.linalg.norm(second - scenes.middle(2))]
     radii = [scenes.BALLS[1][1], scenes.BALLS[2][1]]
@@ -226,7 +227,7 @@ def test_clicks_of_a_distance_meet_the_balls_that_they_point_at(page) -> None:
 
 @pytest.mark.release
 def test_distance_of_two_clicks_is_written_into_the_picture_in_mm(page) -> None:
-    first, second, text = measure_distance(page, 1, 2)
+    first, second, text = measure_distance(page, first=1, second=2)
 
     wait_until_drawn(page)
     assert text == f"{np.linalg.norm(second - first):.1f} mm"
@@ -235,7 +236,7 @@ def test_distance_of_two_clicks_is_written_into_the_picture_in_mm(page) -> None:
 
 @pytest.mark.release
 def test_button_clear_removes_a_distance(page) -> None:
-    measure_distance(page, 1, 2)
+    measure_distance(page, first=1, second=2)
 
     page.find_element("id", "clear").click()
 
@@ -251,7 +252,7 @@ def lengths_in_sight(page, view: str) -> np.ndarray:
 
 
 def test_line_between_two_balls_is_in_sight_from_behind_in_one_piece_between_them(page) -> None:
-    first, second, _ = measure_distance(page, 0, 1)
+    first, second, _ = measure_distance(page, first=0, second=1)
 
     (length,) = lengths_in_sight(page, "posterior")  # one piece
 
@@ -261,7 +262,7 @@ def test_line_between_two_balls_is_in_sight_from_behind_in_one_piece_between_the
 
 
 def test_line_between_two_balls_is_in_sight_from_the_side_of_the_clicks(page) -> None:
-    first, second, _ = measure_distance(page, 0, 1)
+    first, second, _ = measure_distance(page, first=0, second=1)
 
     lengths = lengths_in_sight(page, "anterior")
 
@@ -352,7 +353,7 @@ def test_slider_of_a_clip_plane_moves_it_on(page) -> None:
     half_way = 0.5  # where a new plane lies
     assert facts(page)["clips"][0]["share"] == half_way
 
-    drag(page, page.find_element("css selector", "#clips input"), 0, 0, 45, 0)
+    drag(page, page.find_element("css selector", "#clips input"), dx=45, dy=0)
 
     wait_until_drawn(page)
     assert facts(page)["clips"][0]["share"] > half_way
