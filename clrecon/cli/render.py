@@ -18,6 +18,7 @@ from clrecon.jobs.inputs import CLOUD_INPUTS, MESH_INPUTS, is_cloud_file, is_onl
 from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.jobs.options import InputSettings, preset_option
 from clrecon.jobs.render.settings import (
+    ALL_PRESETS,
     COLORS,
     CURVED_KINDS,
     MESH_COLORS,
@@ -108,7 +109,9 @@ class Looks:
         words=describe_modes(),
     )
     preset: str | None = preset_option(
-        "colours, opacities, light and mode by tissue (default: bone)", first=True, words=describe_presets()
+        "colours, opacities, light and mode by tissue (default: bone); all: a contact sheet of them",
+        first=True,
+        words=(*describe_presets(), ALL_PRESETS),
     )
     transfer_function: str | None = option(
         "--transfer-function FILE[:NAME]",
@@ -430,5 +433,6 @@ def _describe_picture(picture: dict[str, Any]) -> str:
     if picture["tiles"]:
         many = len(picture["tiles"])
         wide, high = picture["tile_size"]
-        shown += f", {count_of(many, 'slice')} of {wide} x {high} pixels"
+        noun = "preset" if "preset" in picture["tiles"][0] else "slice"
+        shown += f", {count_of(many, noun)} of {wide} x {high} pixels"
     return f"{picture['view']}: {width} x {height}, {scale}{shown}"

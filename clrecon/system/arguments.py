@@ -110,7 +110,9 @@ PointKind = Literal["surface", "cortex", "shell", "voxels"]
 ProjectionKind = Literal["mip", "minip", "mean", "drr"]
 Combination = Literal["mean", "max", "min"]
 CurvedKind = Literal["straightened", "stretched"]
-ModeName = Literal["dvr", "mip", "minip", "mean", "drr", "surface", "slices", "slice", "cpr", "points", "mesh"]
+ModeName = Literal[
+    "dvr", "mip", "minip", "mean", "drr", "surface", "slices", "slice", "cpr", "presets", "points", "mesh"
+]  # fmt: skip
 PresetName = Literal["bone", "spine", "skin", "lung", "vessels", "muscle", "metal", "x-ray", "mip", "minip"]
 WindowName = Literal["bone", "soft", "lung", "abdomen", "mediastinum", "brain"]
 DirectionName = Literal["anterior", "posterior", "left", "right", "superior", "inferior"]

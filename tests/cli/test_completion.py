@@ -41,7 +41,7 @@ def bash_script(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["clrecon", "mesh", "ct", "--keep-l"], ["--keep-largest"]),
         (["clrecon", "mesh", "ct", "--space", ""], ["lps", "ras"]),
         (["clrecon", "mesh", "ct", "--preset", "cort"], ["cortical-bone"]),
-        (["clrecon", "render", "ct", "--preset", ""], list(PRESETS)),
+        (["clrecon", "render", "ct", "--preset", ""], [*PRESETS, "all"]),
         (["clrecon", "render", "ct", "--view", "ax"], ["axial"]),
         (["clrecon", "mesh", "ct", "-o", ""], []),  # bash itself completes the names of files
         (["clrecon", "mesh", ""], []),

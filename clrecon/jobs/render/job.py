@@ -91,7 +91,7 @@ _NOUNS = {"points": "cloud", "mesh": "mesh"}
 def find_emptiness(picture: Rendering) -> str | None:
     values = None if picture.values is None else picture.values[np.isfinite(picture.values)]
     if values is None or not values.size:
-        if np.isfinite(picture.depth).any():
+        if np.isfinite(picture.depth).any() or picture.mode == "presets":
             return None
         return (
             f"nothing of the {_NOUNS.get(picture.mode, 'volume')} shows in mode {picture.mode}:"
@@ -358,7 +358,8 @@ def _leave_out_surroundings(volume: Volume, settings: RenderSettings, device: De
 
 def _try_picture(device: Device, settings: RenderSettings) -> None:
     """Build the kernels, of volumes those for int16, by taking a small picture of an empty volume or of one point."""
-    mode = "slice" if settings.mode == "cpr" else settings.mode  # the same kernel, and no curve is needed
+    # The same kernels, without a curve and in one picture.
+    mode = {"cpr": "slice", "presets": "dvr"}.get(settings.mode, settings.mode)
     subject: Volume | PointCloud | Mesh
     if mode == "mesh":
         subject = Mesh(np.eye(3), [(0, 1, 2)])
@@ -464,7 +465,7 @@ def check_pictures(files: PictureFiles, settings: RenderSettings) -> list[tuple[
     for name in ("depth", "values"):
         if getattr(files, name) is not None:
             check_known(settings.mode, name)
-    if files.depth is not None and settings.is_sheet:
+    if files.depth is not None and settings.style.is_sheet:
         raise UsageError("a contact sheet has no depths: its slices lie in planes of their own")
     if settings.background == "transparent":
         picture = "" if files.picture is None else extension_of(files.picture)[1:]

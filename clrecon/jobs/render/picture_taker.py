@@ -11,7 +11,7 @@ from clrecon.geometry.grid import Grid
 from clrecon.jobs.render.settings import SPINES, LabelLook, RenderSettings
 from clrecon.labels.reader import read_all_labels
 from clrecon.rendering.looks.colors import is_transparent
-from clrecon.rendering.looks.presets import find_preset
+from clrecon.rendering.looks.presets import ALL_PRESETS, find_preset
 from clrecon.rendering.looks.transfer_files import load_transfer_function
 from clrecon.rendering.pictures.label_style import NO_LABEL
 from clrecon.rendering.pictures.object_looks import MESH_COLORS, MeshLook, PointLook
@@ -150,7 +150,7 @@ class PictureTaker(Closing):
             picture = self._take_points(self.style, view["camera"], view["size"])
         else:
             picture = self._open_volume().render(self.style, background=settings.background, **view)
-        letters = settings.letters and not settings.is_sheet  # each slice of a sheet has its own
+        letters = settings.letters and not self.style.is_sheet  # each slice of a sheet has its own
         picture = picture.annotated(letters=letters, scale_bar=settings.scale_bar, caption=settings.caption)
         if not isinstance(self.style, MeshLook) or self.style.color_by is None:
             return picture
@@ -196,7 +196,7 @@ class PictureTaker(Closing):
 
 def _shown_function(settings: RenderSettings, style: Style) -> TransferFunction | None:
     """Return the transfer function of a style, or that of the preset that the style was made from."""
-    if settings.preset_used is not None:
+    if settings.preset_used not in (None, ALL_PRESETS):
         return find_preset(settings.preset_used).transfer_function
     if isinstance(style, VolumeLook):
         return style.function

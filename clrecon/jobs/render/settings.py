@@ -27,6 +27,7 @@ from clrecon.labels import LabelMap
 from clrecon.rendering.looks.colors import COLORS as COLORS
 from clrecon.rendering.looks.colors import find_color
 from clrecon.rendering.looks.lighting import UNSHADED, Lighting
+from clrecon.rendering.looks.presets import ALL_PRESETS as ALL_PRESETS
 from clrecon.rendering.looks.presets import DEFAULT_PRESET, PRESETS, find_preset
 from clrecon.rendering.looks.transfer_function import TransferFunction
 from clrecon.rendering.looks.window import WINDOWS as WINDOWS
@@ -344,11 +345,7 @@ class RenderSettings(InputSettings):
         """Width and height in pixels; for a curved reformation without `size` they depend on the curve."""
         if self.size is not None:
             return self.size
-        return SHEET_SIZE if self.is_sheet else directions.DEFAULT_SIZE
-
-    @property
-    def is_sheet(self) -> bool:
-        return isinstance(self.style, PlaneCut) and self.style.sheet is not None
+        return SHEET_SIZE if self.style.is_sheet else directions.DEFAULT_SIZE
 
     @property
     def files_read(self) -> tuple[str, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -20,15 +21,17 @@ from clrecon.operators.rays.slices import choose_slices, overlay_slices, overlay
 from clrecon.operators.rays.surface_pictures import cast_surface
 from clrecon.operators.reformat.cut import take_contact_sheet, take_curve, take_cut
 from clrecon.operators.resident.device_volume import DeviceVolume, VolumeWorker
-from clrecon.rendering import Rendering
+from clrecon.rendering import PRESETS, Rendering
 from clrecon.rendering.looks.colors import is_transparent
+from clrecon.rendering.pictures.annotations import edge_letters
 from clrecon.rendering.pictures.label_style import LabelStyle
-from clrecon.rendering.pictures.modes import Look, check_known, find_style
+from clrecon.rendering.pictures.modes import Look, check_known, find_style, make_style
 from clrecon.rendering.pictures.object_looks import MeshLook, PointLook
-from clrecon.rendering.pictures.sheets import SHEET_SIZE
+from clrecon.rendering.pictures.sheets import SHEET_SIZE, SheetLayout, lay_out, write_on_tile
 from clrecon.rendering.pictures.styles import (
     CurveCut,
     PlaneCut,
+    PresetSheet,
     Projection,
     SlicesInSpace,
     Style,
@@ -40,6 +43,7 @@ from clrecon.rendering.views.clip import ShownLabels, check_center, find_seen_bo
 from clrecon.rendering.views.directions import ANTERIOR, DEFAULT_SIZE, checked_size, default_view
 from clrecon.rendering.views.reformation import find_plane
 from clrecon.system.arguments import DirectionName, ModeName, ViewName, explains_arguments
+from clrecon.system.light_dataclass import replace
 from clrecon.system.progress import Progress, ignore_progress
 
 if TYPE_CHECKING:
@@ -181,9 +185,9 @@ class VolumeRenderer(VolumeWorker):
         progress = progress or ignore_progress
         if isinstance(style, CurveCut):
             return take_curve(self._resident, style, placement.view, placement.up, size, background, progress)
-        is_sheet = isinstance(style, PlaneCut) and style.sheet is not None
-        own_size = SHEET_SIZE if is_sheet else DEFAULT_SIZE
-        size = checked_size(own_size if size is None else size)
+        if size is None:
+            size = SHEET_SIZE if style.is_sheet else DEFAULT_SIZE
+        size = checked_size(size)
         if isinstance(style, Projection) and style.leaves_out and LEFT_OUT not in self.volume.report:
             return self._within(progress).render(
                 style, camera=camera, view=view, up=up, zoom=zoom, view_angle=view_angle, center=center,
@@ -192,6 +196,8 @@ class VolumeRenderer(VolumeWorker):
         if isinstance(style, PlaneCut):
             return self._cut(style, placement, size, background, progress)
         camera = placement.camera or placement.camera_for(self.frame(style), size)
+        if isinstance(style, PresetSheet):
+            return self._take_presets(style, camera, size, background, progress)
         shot = Shot(camera, size, None if is_transparent(background) else background, progress)
         if isinstance(style, SlicesInSpace):
             return overlay_slices(self._resident, style, shot)
@@ -262,6 +268,48 @@ class VolumeRenderer(VolumeWorker):
             return take_contact_sheet(self._resident, style, plane, self.frame(style), size, background, progress)
         return take_cut(self._resident, style, plane, size, background, progress)
 
+    def _take_presets(
+        self,
+        style: PresetSheet,
+        camera: Camera,
+        size: tuple[int, int],
+        background: str | Sequence[float],
+        progress: Progress,
+    ) -> Rendering:
+        """Take a picture with each preset, in tiles that fit what a picture of this size would show.
+
+        The result has no camera and no depths; ``report["tiles"]`` has ``preset``, ``left`` and ``top`` (pixels).
+        """
+        layout, camera = _lay_out_presets(self.frame(style), camera, size)
+        width, height = layout.tile
+        edges = edge_letters(camera)
+        image = np.zeros((*size[::-1], 4), np.uint8)
+        tiles: list[dict[str, Any]] = []
+        seconds: Counter[str] = Counter()
+        warnings: dict[str, None] = {}
+        for number, (preset, (left, top)) in enumerate(zip(PRESETS, layout.corners, strict=True)):
+            progress("render", number, len(PRESETS))
+            look = make_style(preset=preset, ray_step=style.ray_step, clip=style.clip)
+            picture = self.render(look, camera=camera, size=layout.tile, background=background)
+            image[top : top + height, left : left + width] = write_on_tile(picture.image, (preset,), edges)
+            tiles.append({"preset": preset, "left": left, "top": top})
+            seconds.update(picture.report["seconds"])
+            warnings |= dict.fromkeys(picture.report["warnings"])
+        progress("render", len(PRESETS), len(PRESETS))
+        nothing = np.full(size[::-1], np.nan, np.float32)
+        report = {
+            **{name: picture.report[name] for name in ("device", "driver", "slabs")},
+            "mode": style.mode,
+            "pixel_mm": camera.pixel_mm(layout.tile) if camera.is_parallel else None,
+            "edges": edges,
+            "tiles": tiles,
+            "tile_size": [width, height],
+            "seconds": dict(seconds),
+            "warnings": list(warnings),
+        }
+        sheet = Rendering(image, nothing, nothing, None, None, style.mode, report)
+        return sheet if is_transparent(background) else sheet.with_background(background)
+
     def _checked_step(self, ray_step: float | None) -> float:
         smallest = min(self.volume.spacing)
         diagonal = float(np.linalg.norm(np.ptp(box_corners(self.volume), axis=0)))
@@ -278,6 +326,18 @@ class VolumeRenderer(VolumeWorker):
             f"the ray step is a length in mm, at least {finest:.3g} in this volume (a hundredth of its smallest"
             f" spacing, and {_MOST_STEPS:,} through its diagonal), not {ray_step!r}"
         )
+
+
+def _lay_out_presets(shown: Grid, camera: Camera, size: tuple[int, int]) -> tuple[SheetLayout, Camera]:
+    """Return tiles and the camera of each; in perspective they have the shape of the whole sheet."""
+    if camera.parallel_scale is None:
+        return lay_out(len(PRESETS), size, size), camera
+    right, up, _ = camera.basis()
+    corners = box_corners(shown)
+    extent = float(np.ptp(corners @ right)), float(np.ptp(corners @ up))
+    whole = max(extent[0] / size[0], extent[1] / size[1])
+    layout = lay_out(len(PRESETS), extent, size, zoom=whole / camera.pixel_mm(size))
+    return layout, replace(camera, parallel_scale=0.5 * layout.tile[1] * layout.pixel_mm)
 
 
 class Place(NamedTuple):

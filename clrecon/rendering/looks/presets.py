@@ -9,6 +9,8 @@ from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.text import unknown_name
 
 DEFAULT_PRESET = "bone"
+ALL_PRESETS = "all"
+"""In place of a name: every preset, side by side."""
 
 
 @dataclass(frozen=True)

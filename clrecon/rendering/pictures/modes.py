@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from clrecon.errors import UsageError
 from clrecon.labels import LabelMap
 from clrecon.rendering.looks.lighting import Lighting
-from clrecon.rendering.looks.presets import find_preset
+from clrecon.rendering.looks.presets import ALL_PRESETS, find_preset
 from clrecon.rendering.looks.transfer_function import TransferFunction
 from clrecon.rendering.pictures.object_looks import MESH_COLORS, MeshLook, PointLook
 from clrecon.rendering.pictures.styles import (
@@ -20,6 +20,7 @@ from clrecon.rendering.pictures.styles import (
     Color,
     CurveCut,
     PlaneCut,
+    PresetSheet,
     Projection,
     SlicesInSpace,
     Style,
@@ -50,6 +51,7 @@ MODES = {
     "slices": Mode(SlicesInSpace, "slices of the scan in space, translucent, at their positions"),
     "slice": Mode(PlaneCut, "a plane through the volume in any direction, of any thickness"),
     "cpr": Mode(CurveCut, "curved planar reformation along a centre line"),
+    "presets": Mode(PresetSheet, "a contact sheet: the same view with each preset"),
     "points": Mode(PointLook, "the points of a cloud, coloured by HU, label or reason of removal"),
     "mesh": Mode(MeshLook, "the triangles of a mesh, shaded"),
 }
@@ -101,10 +103,10 @@ _BESIDE = {
     "preset": tuple(mode for mode in MODES if mode not in ("surface", "points", "mesh")),
     "transfer_function": ("mip", "minip", "mean", "drr"),
     "lighting": ("mip", "minip", "mean", "drr", "slices"),
-    "zoom": (*_CAMERAS, "slice"),
-    "view_angle": _CAMERAS,
-    "center": (*_CAMERAS, "slice"),
-    "letters": (*_CAMERAS, "slice", "cpr"),
+    "zoom": (*_CAMERAS, "presets", "slice"),
+    "view_angle": (*_CAMERAS, "presets"),
+    "center": (*_CAMERAS, "presets", "slice"),
+    "letters": (*_CAMERAS, "presets", "slice", "cpr"),
     "depth": ("dvr", "mip", "minip", "surface", "slices", "slice", "points", "mesh"),
     "values": ("mip", "minip", "mean", "drr", "slice", "cpr"),
     "turntable": _CAMERAS,
@@ -135,8 +137,8 @@ def choose_mode(mode: str | None = None, preset: str | None = None, **look: obje
     """Choose the mode that names and keywords ask for: a name of `MODES`, by default volume rendering.
 
     Without `mode` an iso value means a surface, a curve means a curved reformation, a sheet means slices, what vertices
-    are coloured by means a mesh, a radius of points or what they are coloured by means points, and a preset means its
-    own mode.
+    are coloured by means a mesh, a radius of points or what they are coloured by means points, a preset means its own
+    mode, and all presets mean a sheet of them.
     """
     if mode is not None:
         if not isinstance(mode, str) or mode not in MODES:
@@ -152,6 +154,8 @@ def choose_mode(mode: str | None = None, preset: str | None = None, **look: obje
         return "mesh"
     if look.get("color_by") is not None or look.get("radius_mm") is not None:
         return "points"
+    if preset == ALL_PRESETS:
+        return "presets"
     return "dvr" if preset is None else find_preset(preset).mode
 
 
@@ -173,6 +177,9 @@ def make_style(mode: str | None = None, preset: str | None = None, **look: objec
         if "transfer_function" in given:
             raise UsageError(f"a picture has a preset ({preset}) or a transfer function, not both")
         check_known(mode, "preset")
+        if (preset == ALL_PRESETS) != (mode == "presets"):
+            raise UsageError(f"mode presets shows all presets side by side, not preset {preset} in mode {mode}")
+    if preset is not None and preset != ALL_PRESETS:
         chosen = find_preset(preset)
         if style is VolumeLook:
             given["transfer_function"] = chosen.name

@@ -57,7 +57,7 @@ def lay_out(count: int, mm: tuple[float, float], size: tuple[int, int], zoom: fl
             best = pixel, columns, (tile[0], tile[1])
     if best is None or min(best[2]) < LEAST_TILE:
         raise UsageError(
-            f"{count:,} slices are too many for a sheet of {size[0]} x {size[1]} pixels, in which each needs"
+            f"{count:,} pictures are too many for a sheet of {size[0]} x {size[1]} pixels, in which each needs"
             f" {LEAST_TILE}: show fewer, or make it larger"
         )
     pixel, columns, (width, height) = best

@@ -96,6 +96,11 @@ class Style:
         """The name of this kind of picture, one of ``clrecon.rendering.pictures.modes.MODES``."""
         return self._mode
 
+    @property
+    def is_sheet(self) -> bool:
+        """True where pictures stand side by side, each with letters of its own."""
+        return False
+
 
 @dataclass(frozen=True, kw_only=True)
 class _Labelled(Style):
@@ -226,6 +231,27 @@ class Projection(Style):
     def leaves_out(self) -> bool:
         """True where a picture leaves out what lies outside of the body."""
         return self.kind == "minip" and not self.keep_air
+
+
+@dataclass(frozen=True)
+class PresetSheet(Style):
+    """A contact sheet of presets: the same view with each of them, under its name.
+
+    Parameters
+    ----------
+    ray_step, clip
+        As of `Projection`.
+    """
+
+    _mode: ClassVar[str] = "presets"
+
+    _: KW_ONLY
+    ray_step: float | None = style_field(None, checks.ray_step)
+    clip: Clip | None = style_field(None, checks.instance_of("clip", Clip))
+
+    @property
+    def is_sheet(self) -> bool:
+        return True
 
 
 @dataclass(frozen=True)
@@ -371,6 +397,10 @@ class PlaneCut(_Cut):
         if self.sheet is not None and (self.offset_mm or self.pixel_mm is not None):
             option = name_parameter("offset_mm" if self.offset_mm else "pixel_mm")
             raise UsageError(f"a contact sheet shows slices through all of the scan, at one scale: leave {option} out")
+
+    @property
+    def is_sheet(self) -> bool:
+        return self.sheet is not None
 
 
 @dataclass(frozen=True)

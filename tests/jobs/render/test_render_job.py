@@ -504,7 +504,11 @@ def sheet_settings(device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: P
 def test_report_of_a_sheet_has_its_size_slices_and_colours_of_labels(
     sheet_settings: RenderSettings, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
 ) -> None:
-    assert (sheet_settings.mode, sheet_settings.is_sheet, sheet_settings.size_used) == ("slice", True, (1600, 1200))
+    assert (sheet_settings.mode, sheet_settings.style.is_sheet, sheet_settings.size_used) == (
+        "slice",
+        True,
+        (1600, 1200),
+    )
 
     report = make_pictures(sphere[0], PictureFiles(tmp_path / "a.png"), sheet_settings)
 

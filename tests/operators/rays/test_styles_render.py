@@ -28,6 +28,7 @@ from clrecon.operators.rays import ray_pictures
 from clrecon.operators.reformat import sheets
 from clrecon.rendering.pictures import styles
 from clrecon.rendering.pictures.modes import MODES
+from clrecon.rendering.pictures.styles import PresetSheet
 
 pytestmark = pytest.mark.opencl
 
@@ -69,6 +70,7 @@ SAME: dict[str, tuple[Style, dict[str, Any]]] = {
         {"iso_value": 300, "color": "red", "depth_cue": 0.4, "shadows": True, "lighting": SIDE},
     ),
     "slices": (SlicesInSpace([7, 3], opacity=0.9), {"mode": "slices", "slices": [7, 3], "slice_opacity": 0.9}),
+    "presets": (PresetSheet(ray_step=0.9), {"preset": "all", "ray_step": 0.9}),
     "slice": (
         PlaneCut(offset_mm=2.5, thickness=5.0, combine="max", window=(0, 900)),
         {"mode": "slice", "offset_mm": 2.5, "thickness": 5, "combine": "max", "window": (0, 900)},
@@ -85,11 +87,12 @@ def test_table_of_styles_has_every_mode_of_volumes() -> None:
 @pytest.mark.parametrize("name", SAME)
 def test_a_style_and_keywords_make_the_same_picture(device: Any, name: str) -> None:
     style, look = SAME[name]
-    place: dict[str, Any] = {"view": (20, 30), "size": SIZE}
+    size = (400, 300) if style.is_sheet else SIZE  # ten tiles of at least 64 pixels
+    place: dict[str, Any] = {"view": (20, 30), "size": size}
     with VolumeRenderer(body(), device=device) as renderer:
         first, second = renderer.render(style, **place), renderer.render(**look, **place)
     third = clrecon.render(body(), style, device=device, **place)
-    assert first.mode == style.mode and first.size == SIZE
+    assert first.mode == style.mode and first.size == size
     assert first.image[..., :3].any()
     for other in (second, third):
         for array in ("image", "depth", "expected_depth", "values"):

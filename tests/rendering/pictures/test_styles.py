@@ -23,6 +23,7 @@ from clrecon.rendering.pictures.object_looks import MeshLook, PointLook
 from clrecon.rendering.pictures.styles import (
     CurveCut,
     PlaneCut,
+    PresetSheet,
     Projection,
     SlicesInSpace,
     Style,
@@ -77,6 +78,7 @@ WRONG: dict[type[Style], Wrong] = {
         "window": [((5, 5), "window"), ((np.nan, 5), "window"), ((1, 2, 3), "window")],
         "keep_air": [("no", "keep_air is True or False, not 'no'"), (1, "keep_air")],
     },
+    PresetSheet: {**RAYS},
     SurfaceLook: {
         **LABELLED,
         "iso_value": [(np.nan, "iso value is nan"), ("bone", "a number of HU"), (1e300, "beyond"), (None, "iso value")],
