@@ -15,7 +15,7 @@ from clrecon.errors import NoSurfaceError, UsageError
 
 
 @pytest.fixture(scope="module")
-def volume() -> clrecon.Volume:
+def ball_of_bone() -> clrecon.Volume:
     """A ball of bone in soft tissue."""
     k, j, i = np.indices((24, 40, 40)) - np.array([11.5, 19.5, 19.5])[:, None, None, None]
     depth = 8.0 - np.sqrt(k**2 + j**2 + i**2)
@@ -42,9 +42,11 @@ def boxed(volume: clrecon.Volume) -> clrecon.LabelMap:
 
 @pytest.mark.first_device
 @pytest.mark.parametrize("taker", TAKERS)
-def test_auto_is_the_level_that_choose_iso_value_measures(taker: str, volume: clrecon.Volume, device: Any) -> None:
-    measured = clrecon.choose_iso_value(volume).iso_value
-    auto, given = (TAKERS[taker](volume, level, device) for level in ("auto", measured))
+def test_auto_is_the_level_that_choose_iso_value_measures(
+    taker: str, ball_of_bone: clrecon.Volume, device: Any
+) -> None:
+    measured = clrecon.choose_iso_value(ball_of_bone).iso_value
+    auto, given = (TAKERS[taker](ball_of_bone, level, device) for level in ("auto", measured))
     if isinstance(auto, clrecon.Mesh):
         assert_same(auto, given)
     elif isinstance(auto, clrecon.PointCloud):
@@ -55,9 +57,9 @@ def test_auto_is_the_level_that_choose_iso_value_measures(taker: str, volume: cl
 
 @pytest.mark.first_device
 @pytest.mark.parametrize("taker", TAKERS)
-def test_report_says_why_auto_chose_its_level(taker: str, volume: clrecon.Volume, device: Any) -> None:
-    choice = clrecon.choose_iso_value(volume)
-    auto, given = (TAKERS[taker](volume, level, device).report for level in ("auto", choice.iso_value))
+def test_report_says_why_auto_chose_its_level(taker: str, ball_of_bone: clrecon.Volume, device: Any) -> None:
+    choice = clrecon.choose_iso_value(ball_of_bone)
+    auto, given = (TAKERS[taker](ball_of_bone, level, device).report for level in ("auto", choice.iso_value))
     if taker == "filled":
         auto, given = auto["solid"], given["solid"]
     assert auto["iso_value_reason"] == choice.reason

@@ -64,7 +64,7 @@ def test_a_device_that_computes_the_surface_of_a_ball_wrongly_fails_with_the_fau
 
 
 def ball_with_normals() -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    vertices, triangles = sphere(CENTRE, RADIUS, 5)
+    vertices, triangles = sphere(CENTRE, radius=RADIUS, rounds=5)
     return vertices, triangles, (vertices - CENTRE) / RADIUS
 
 
@@ -93,7 +93,7 @@ class FakeDevice(SimpleNamespace):
 
 
 @pytest.fixture
-def checked(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Any]]:
+def checked_devices(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Any]]:
     """The devices that were checked; those named "wrong" fail.  Files of the cache are a dict."""
     seen: list[Any] = []
     files: dict[str, bytes] = {}
@@ -114,65 +114,67 @@ def fake_device(**changed: Any) -> Any:
     return FakeDevice(**changed)
 
 
-def test_a_device_is_checked_once_for_all_processes(checked: list[Any]) -> None:
+def test_a_device_is_checked_once_for_all_processes(checked_devices: list[Any]) -> None:
     first, of_another_process = fake_device(), fake_device()
     assert select.find_fault(first) == select.find_fault(first) == ""
     assert select.find_fault(of_another_process) == ""
-    assert checked == [first]
+    assert checked_devices == [first]
 
 
 @pytest.mark.parametrize("changed", [{"driver": "2.1"}, {"name": "M"}, {"platform_version": "1.1"}])
-def test_another_driver_device_or_platform_is_checked_anew(checked: list[Any], changed: dict[str, str]) -> None:
+def test_another_driver_device_or_platform_is_checked_anew(checked_devices: list[Any], changed: dict[str, str]) -> None:
     first, other = fake_device(), fake_device(**changed)
     select.find_fault(first)
     select.find_fault(other)
-    assert checked == [first, other]
+    assert checked_devices == [first, other]
 
 
-def test_another_version_of_the_package_checks_anew(checked: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_version_of_the_package_checks_anew(
+    checked_devices: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     first, later = fake_device(), fake_device()
     select.find_fault(first)
     monkeypatch.setattr(select, "package_version", lambda: "0.0")
     select.find_fault(later)
-    assert checked == [first, later]
+    assert checked_devices == [first, later]
 
 
-def test_a_failed_check_is_made_again_in_the_next_process(checked: list[Any]) -> None:
+def test_a_failed_check_is_made_again_in_the_next_process(checked_devices: list[Any]) -> None:
     of_first_process, of_next_process = fake_device(name="wrong"), fake_device(name="wrong")
     for wrong in (of_first_process, of_next_process):
         assert select.find_fault(wrong) == select.find_fault(wrong) == "wrong sums"
-    assert checked == [of_first_process, of_next_process]
+    assert checked_devices == [of_first_process, of_next_process]
 
 
 @pytest.fixture
-def cached_files(checked: list[Any]) -> dict[str, bytes]:
+def cached_files(checked_devices: list[Any]) -> dict[str, bytes]:
     """What the files of the cache hold, by their keys."""
     return select.read_binary.__self__  # type: ignore[attr-defined, no-any-return]
 
 
 @pytest.mark.parametrize(("name", "fault"), [("wrong", "wrong sums"), ("right", "")])
-def test_what_a_check_found_is_remembered_without_another(checked: list[Any], name: str, fault: str) -> None:
+def test_what_a_check_found_is_remembered_without_another(checked_devices: list[Any], name: str, fault: str) -> None:
     first = fake_device(name=name)
     assert select.remembered_fault(first) == ""  # nothing is known yet
     select.find_fault(first)
     assert select.remembered_fault(fake_device(name=name)) == fault
-    assert checked == [first]
+    assert checked_devices == [first]
 
 
-def test_no_fault_of_a_simulator_is_remembered(checked: list[Any]) -> None:
+def test_no_fault_of_a_simulator_is_remembered(checked_devices: list[Any]) -> None:
     select.find_fault(fake_device(name="wrong"))
     assert select.remembered_fault(fake_device(name="wrong", is_simulator=True)) == ""
 
 
 def test_no_fault_is_remembered_where_the_check_is_switched_off(
-    checked: list[Any], monkeypatch: pytest.MonkeyPatch
+    checked_devices: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     select.find_fault(fake_device(name="wrong"))
     monkeypatch.setenv(select.VARIABLE, "off")
     assert select.remembered_fault(fake_device(name="wrong")) == ""
 
 
-def test_an_interrupted_check_leaves_no_fault(checked: list[Any], cached_files: dict[str, bytes]) -> None:
+def test_an_interrupted_check_leaves_no_fault(checked_devices: list[Any], cached_files: dict[str, bytes]) -> None:
     def interrupt(device: Any) -> str:
         assert list(cached_files.values()) == [select._BEGUN]
         raise KeyboardInterrupt
@@ -193,7 +195,7 @@ ENDED = "a process ended while it checked this device"
     ids=["begun", "crashed"],
 )
 def test_fault_of_a_check_that_a_process_did_not_end_is_remembered(
-    checked: list[Any], cached_files: dict[str, bytes], kept_by_last_process: bytes, fault: str
+    checked_devices: list[Any], cached_files: dict[str, bytes], kept_by_last_process: bytes, fault: str
 ) -> None:
     cached_files[select._key(fake_device())] = kept_by_last_process
     assert select.remembered_fault(fake_device()) == fault
@@ -213,7 +215,7 @@ def test_fault_of_a_check_that_a_process_did_not_end_is_remembered(
     ids=["aborts", "exits", "finds a fault", "finds none"],
 )
 def test_a_check_that_a_process_did_not_end_is_made_again_by_a_child(
-    checked: list[Any],
+    checked_devices: list[Any],
     cached_files: dict[str, bytes],
     kept_by_last_process: bytes,
     code_of_child: str,
@@ -225,7 +227,7 @@ def test_a_check_that_a_process_did_not_end_is_made_again_by_a_child(
     cached_files[key] = kept_by_last_process
     assert select.find_fault(fake_device(index=0)) == fault
     assert cached_files[key] == mark + fault.encode()
-    assert checked == []  # not by this process
+    assert checked_devices == []  # not by this process
 
 
 @pytest.fixture
@@ -236,29 +238,29 @@ def no_linker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems have other linkers")
 def test_pocl_without_a_linker_is_checked_by_a_child_and_the_fault_names_ld(
-    checked: list[Any], cached_files: dict[str, bytes], no_linker: None
+    checked_devices: list[Any], cached_files: dict[str, bytes], no_linker: None
 ) -> None:
     select.register(check_ball, "-c", "import os; os.abort()")
 
     fault = select.find_fault(fake_device(index=0, platform="Portable Computing Language"))
 
     assert_facts(fault, "SIGABRT", "ld", "binutils")
-    assert checked == []  # not by this process, which would have been ended
+    assert checked_devices == []  # not by this process, which would have been ended
 
 
 @pytest.mark.parametrize("platform", ["NVIDIA CUDA", "rusticl"])
 def test_other_drivers_without_a_linker_are_checked_by_this_process(
-    checked: list[Any], no_linker: None, platform: str
+    checked_devices: list[Any], no_linker: None, platform: str
 ) -> None:
     device = fake_device(platform=platform)
 
     assert select.find_fault(device) == ""
 
-    assert checked == [device]
+    assert checked_devices == [device]
 
 
 def test_a_check_that_a_process_did_not_end_stays_a_fault_where_no_child_can_be_started(
-    checked: list[Any], cached_files: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
+    checked_devices: list[Any], cached_files: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cached_files[select._key(fake_device())] = select._BEGUN
     monkeypatch.setattr(sys, "executable", "")
@@ -296,18 +298,18 @@ def test_a_crash_in_the_check_is_listed_as_a_fault_until_a_process_finds_none(de
     assert listed_fault() == ""
 
 
-def test_a_simulator_is_not_checked(checked: list[Any]) -> None:
+def test_a_simulator_is_not_checked(checked_devices: list[Any]) -> None:
     assert select.find_fault(fake_device(is_simulator=True)) == ""
-    assert checked == []
+    assert checked_devices == []
 
 
 def test_a_device_is_not_checked_but_remarked_where_the_check_is_switched_off(
-    checked: list[Any], monkeypatch: pytest.MonkeyPatch
+    checked_devices: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(select.VARIABLE, "off")
     wrong = fake_device(name="wrong")
     assert select.find_fault(wrong) == ""
-    assert checked == []
+    assert checked_devices == []
     assert wrong.remarks == [
         "N (P) was not checked at its first use (CLRECON_DEVICE_CHECK=off): its results may be wrong"
     ]

@@ -58,7 +58,8 @@ NOWHERE = np.zeros(3)
 
 
 def nodes_of_bricks(along_x: int, along_y: int = 2, along_z: int = 3) -> Nodes:
-    return Nodes(NOWHERE.astype(np.float32), NOWHERE, np.float32(1.0), (along_x, along_y, along_z))
+    corner = NOWHERE.astype(np.float32)
+    return Nodes(corner=corner, base=NOWHERE, spacing=np.float32(1.0), bricks=(along_x, along_y, along_z))
 
 
 @pytest.mark.parametrize(("bricks", "words"), [(1, 1), (3, 1), (4, 1), (5, 2), (8, 2), (9, 3), (132, 33), (133, 34)])
@@ -77,22 +78,24 @@ def test_words_of_bricks_hold_32_each(bricks, words):
 
 
 def test_layer_of_bricks_takes_four_bytes_a_node():
-    assert nodes_of_bricks(5, 2).layer_bytes == 4 * (8 * 5) * (4 * 2) * 4
+    assert nodes_of_bricks(along_x=5, along_y=2).layer_bytes == 4 * (8 * 5) * (4 * 2) * 4
+
+
+def plan_grid(*, points: int, shape: tuple[int, int, int]) -> GridPlan:
+    places, corner = np.zeros((points, 3), np.float32), NOWHERE.astype(np.float32)
+    return GridPlan(points=places, base=NOWHERE, corner=corner, edge=np.float32(1.0), shape=shape)
 
 
 @pytest.mark.parametrize(("cells", "words"), [(1, 1), (32, 1), (33, 2), (64, 2), (1056, 33), (1057, 34)])
 def test_words_of_a_grid_hold_32_cells_each(cells, words):
-    shape = (cells, 3, 5)
-    plan = GridPlan(np.zeros((1, 3), np.float32), NOWHERE, NOWHERE.astype(np.float32), np.float32(1.0), shape)
+    plan = plan_grid(points=1, shape=(cells, 3, 5))
     assert (plan.words, plan.total_words) == (words, 3 * 5 * words)
 
 
 @pytest.mark.parametrize("points", [1, 1000])
 def test_grid_needs_the_bytes_of_its_buffers(points):
     """The order of the points stays beside their sorted coordinates and the first point of each cell."""
-    shape = (33, 3, 5)  # two words a row
-    places = np.zeros((points, 3), np.float32)
-    plan = GridPlan(places, NOWHERE, NOWHERE.astype(np.float32), np.float32(1.0), shape)
+    plan = plan_grid(points=points, shape=(33, 3, 5))  # two words a row
     cells, order, coordinates, starts = 4 * points, 4 * points, 3 * 4 * (points + PADDING), 4 * (points + 1)
     gathering = cells + order + coordinates + starts
     sorting = order + sort_bytes(device(1), points, points.bit_length())
@@ -236,7 +239,7 @@ SIXTEEN_CHUNKS = 16 * FEWEST_PER_CHUNK
         (device(1), SIXTEEN_CHUNKS, (FEWEST_PER_CHUNK, 16)),
         (device(1), SIXTEEN_CHUNKS + 1, (FEWEST_PER_CHUNK + 1, 16)),
         (device(3), 24 * 5000 + 1, (5001, 24)),
-        (device(3, False), 24 * 5000 + 1, (FEWEST_PER_CHUNK, 30)),
+        (device(3, has_long_items=False), 24 * 5000 + 1, (FEWEST_PER_CHUNK, 30)),
         (device(10_000), MOST_CHUNKS * 5000, (5000, MOST_CHUNKS)),
     ],
     ids=["one key", "sixteen chunks", "one key more", "three cores", "short items", "most chunks"],
@@ -320,7 +323,7 @@ def test_picture_needs_12_bytes_a_pixel_and_32_for_the_state_of_its_ray():
 def test_colours_of_the_transfer_table_have_ten_bits_a_channel(monkeypatch, node, channels):
     monkeypatch.setattr(ray_pictures, "upload", lambda device, table: table)
     function = TransferFunction([(0, 1.0, 0.5, 0.0, 0.0), (100, 0.0, 0.5, 1.0, 1.0)])  # HU, colour, opacity
-    color = int(ray_pictures.TransferTables.of(device(1), function, 1.0).colors_d[node])
+    color = int(ray_pictures.TransferTables.of(device(1), function, ray_step=1.0).colors_d[node])
     # A step of ten bits; measured half.
     assert [color >> 20, color >> 10 & 1023, color & 1023] == pytest.approx(1023 * np.array(channels), abs=1.0)
 
@@ -328,7 +331,7 @@ def test_colours_of_the_transfer_table_have_ten_bits_a_channel(monkeypatch, node
 def test_transfer_table_begins_at_the_lowest_hu_and_shows_all_nodes_but_the_transparent_first(monkeypatch):
     monkeypatch.setattr(ray_pictures, "upload", lambda device, table: table)
     function = TransferFunction([(0, 1.0, 0.5, 0.0, 0.0), (100, 0.0, 0.5, 1.0, 1.0)])
-    tables = ray_pictures.TransferTables.of(device(1), function, 1.0)
+    tables = ray_pictures.TransferTables.of(device(1), function, ray_step=1.0)
     assert tables.low == 0.0
     assert len(tables.colors_d) == ray_pictures.NODES
     assert tables.shown_ends == (1, ray_pictures.NODES - 1)
@@ -374,7 +377,7 @@ def test_three_edges_of_a_missing_or_turned_face_are_open(triangles):
 
 def test_edges_that_are_passed_twice_each_way_are_open():
     each_face_twice = np.concatenate([TETRAHEDRON, TETRAHEDRON])
-    assert _count_open_edges(each_face_twice, 4) == 6
+    assert _count_open_edges(each_face_twice, vertices=4) == 6
 
 
 def test_search_for_ghost_slices_takes_device_memory_and_progress_by_name_alone():
@@ -419,7 +422,8 @@ FAR_VOXELS = np.array([[0, 0, 0], [2047, 2047, 0], [0, 0, 1024]], np.int32)
 
 
 def test_voxels_that_lie_in_their_order_are_not_put_into_another():
-    assert _order_voxels(FAR_VOXELS)[0] is None
+    order, _ = _order_voxels(FAR_VOXELS)
+    assert order is None
 
 
 def test_voxels_of_a_box_of_more_than_2_to_the_31_are_ordered():
@@ -437,9 +441,10 @@ def test_a_voxel_twice_is_refused_with_how_many_there_are():
 @pytest.mark.parametrize(("radius", "pixels"), [(4.0, 8.0), (1.5, 3.0), (1e-9, SMALLEST_DISC), (1e9, LARGEST_DISC)])
 def test_discs_have_their_radius_in_pixels_within_limits(radius, pixels):
     """The camera shows 11.75 mm above and below the middle in 47 rows: half a millimetre a pixel."""
-    camera = Camera((0.0, -50.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), parallel_scale=11.75)
+    camera = Camera(position=(0.0, -50.0, 0.0), focal_point=(0.0, 0.0, 0.0), up=(0.0, 0.0, 1.0), parallel_scale=11.75)
     nothing = np.zeros((0, 3), np.float32)
-    discs = Discs(nothing, np.zeros((0, 4), np.uint8), nothing, radius, Lighting())
+    colors = np.zeros((0, 4), np.uint8)
+    discs = Discs(points=nothing, colors=colors, normals=nothing, radius_mm=radius, lighting=Lighting())
     splats = _Splats(device(1), discs, Shot(camera, (61, 47)))
     assert splats.disc_pixels == pytest.approx(pixels)
 
@@ -456,10 +461,11 @@ TABLE_MM = 1e-5  # float32
 
 
 def test_table_of_an_uneven_stack_has_heights_shifts_and_inverse_gaps(stack_of_uneven):
-    table = stack_of_uneven.arguments["stack_slices"]
-    np.testing.assert_allclose(table[:, 0, 0], HEIGHTS, atol=TABLE_MM)
-    np.testing.assert_allclose(table[:, 0, 1:3], np.column_stack([0.0 * SIDEWAYS, SIDEWAYS]), atol=TABLE_MM)
-    np.testing.assert_allclose(table[:, 0, 3], [*(1.0 / GAPS), 0.0], rtol=1e-5)  # float32; measured 3e-8
+    heights, along_columns, along_rows, inverse_gaps = stack_of_uneven.arguments["stack_slices"][:, 0].T
+    np.testing.assert_allclose(heights, HEIGHTS, atol=TABLE_MM)
+    np.testing.assert_allclose(along_columns, 0.0, atol=TABLE_MM)
+    np.testing.assert_allclose(along_rows, SIDEWAYS, atol=TABLE_MM)
+    np.testing.assert_allclose(inverse_gaps, [*(1.0 / GAPS), 0.0], rtol=1e-6)  # float32; measured 3e-8
 
 
 def test_table_of_an_uneven_stack_has_the_normal_matrix_of_each_slice(stack_of_uneven):
@@ -470,9 +476,9 @@ def test_table_of_an_uneven_stack_has_the_normal_matrix_of_each_slice(stack_of_u
 def test_table_of_an_uneven_stack_has_the_steepest_shift_and_the_smallest_gap(stack_of_uneven):
     steepest = np.abs(np.diff(SIDEWAYS) / GAPS).max()
     np.testing.assert_allclose(stack_of_uneven.slope, [0.0, steepest, 1 / GAPS.min(), 0.0], atol=TABLE_MM)
-    way = np.array([1.0, 2.0, 0.5])  # along columns, rows and height
+    direction = np.array([1.0, 2.0, 0.5])  # along columns, rows and height
     steps = [1.0, 2.0 + 0.5 * steepest, 0.5 / GAPS.min()]
-    np.testing.assert_allclose(stack_of_uneven.index_steps(way), steps, rtol=1e-6)  # float64
+    np.testing.assert_allclose(stack_of_uneven.index_steps(direction), steps, rtol=1e-6)  # float64
 
 
 def test_table_of_an_uneven_stack_counts_slices_and_layers(stack_of_uneven):
@@ -482,7 +488,7 @@ def test_table_of_an_uneven_stack_counts_slices_and_layers(stack_of_uneven):
 
 def plan_field_slabs(monkeypatch, layers_of_room):
     """Slabs of a field of 3 x 2 x 5 bricks, all of them with nodes, on a device with room for so many layers."""
-    nodes = nodes_of_bricks(3, 2, 5)
+    nodes = nodes_of_bricks(along_x=3, along_y=2, along_z=5)
     monkeypatch.setattr(
         field.ocl,
         "describe_shortage",

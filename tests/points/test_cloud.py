@@ -203,9 +203,9 @@ def test_selections_that_name_no_points_are_refused(key: list[Any]) -> None:
 
 
 def test_a_step_counts_the_points_that_it_removed_by_reason() -> None:
-    step = PointStep(
-        numbered_cloud(2), np.array([0, 2, 1, 2, 0], np.uint8), ("noise", "sheet", "ghost"), {"eps_mm": 1.2}
-    )
+    kept, noise, sheet = 0, 1, 2
+    removed = np.array([kept, sheet, noise, sheet, kept], np.uint8)
+    step = PointStep(numbered_cloud(2), removed, reasons=("noise", "sheet", "ghost"), facts={"eps_mm": 1.2})
     assert step.counts == {"noise": 1, "sheet": 2, "ghost": 0}
     assert step.as_dict() == {"points_before": 5, "points_after": 2, "removed": step.counts, "eps_mm": 1.2}
 

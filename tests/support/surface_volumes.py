@@ -25,6 +25,15 @@ def random_volume(
     return Volume(np.random.default_rng(seed).integers(0, high, shape).astype(dtype), affine)
 
 
+def random_labels(shape: Sequence[int], seed: int = 1, numbers: Sequence[int] = (0, 0, 3, 7, 300)) -> np.ndarray:
+    """Blocks of labels, and single voxels of others."""
+    random = np.random.default_rng(seed)
+    coarse = random.choice(np.array(numbers, np.uint16), [-(-n // 3) for n in shape])
+    labels = coarse.repeat(3, 0).repeat(3, 1).repeat(3, 2)[: shape[0], : shape[1], : shape[2]]
+    odd = random.random(shape) < 0.1
+    return np.where(odd, random.choice(np.array(numbers, np.uint16), shape), labels)
+
+
 def smooth_volume(shape: Sequence[int] = (23, 27, 45), affine: np.ndarray = OBLIQUE, seed: int = 1) -> Volume:
     from scipy.ndimage import gaussian_filter
 

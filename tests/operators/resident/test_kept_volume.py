@@ -112,7 +112,7 @@ class CountedSurfaces:
 
         clrecon.extract_isosurface(volume, 0, device=device)  # whose device may be checked at first use
         patch.setattr(Kernel, "order", count_order)
-        sizes = Failing(patch, "buffer", 0).sizes
+        sizes = Failing(patch, "buffer", first=0).sizes
         self.of_new = [clrecon.extract_isosurface(volume, level, device=device) for level in LEVELS]
         self.kernels_of_new, self.buffers_of_new = Counter(kernels), Counter(sizes)
         kernels.clear()

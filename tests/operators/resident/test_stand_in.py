@@ -23,6 +23,7 @@ NEVER_LAST = 1 << 30
 
 @pytest.fixture(scope="module")
 def volume():
+    """12 slices of int16 voxels, each of 14 x 21 x 2 = 588 bytes."""
     return smooth_volume((12, 14, 21))
 
 
@@ -44,7 +45,7 @@ def test_the_cpu_device_takes_over_from_any_buffer_or_launch_on_with_the_same_re
     with DeviceVolume(volume, device=device) as resident:
         expected = WORK[work](resident, labels)
     with monkeypatch.context() as patch, DeviceVolume(volume, device=gpu) as resident:
-        counted = Failing(patch, kind, 0, label=gpu.label)
+        counted = Failing(patch, kind, first=0, label=gpu.label)
         WORK[work](resident, labels)
         assert resident.device is gpu
     count = counted.counts[kind]
@@ -53,7 +54,7 @@ def test_the_cpu_device_takes_over_from_any_buffer_or_launch_on_with_the_same_re
     for first in sorted(firsts):
         gpu = pretended_gpu(device)
         with monkeypatch.context() as patch, DeviceVolume(volume, device=gpu) as resident:
-            Failing(patch, kind, first, NEVER_LAST, label=gpu.label)
+            Failing(patch, kind, first=first, last=NEVER_LAST, label=gpu.label)
             found = WORK[work](resident, labels)
             assert resident.device is device
         for one, other in zip(found, expected, strict=True):
@@ -75,7 +76,7 @@ REPORTS: dict[str, Callable] = {
 def test_warning_of_a_device_that_handed_over_names_the_reason_and_both_devices(
     device, gpu, volume, labels, monkeypatch, work
 ):
-    Failing(monkeypatch, "buffer", 3, NEVER_LAST, label=gpu.label)
+    Failing(monkeypatch, "buffer", first=3, last=NEVER_LAST, label=gpu.label)
     report = REPORTS[work](volume, labels, gpu)
     (warning,) = [text for text in report["warnings"] if "all was done on" in text]
     assert warning.endswith(f"injected: all was done on {device.label} instead of {gpu.label}")
@@ -86,7 +87,7 @@ def test_warning_of_a_device_that_handed_over_names_the_reason_and_both_devices(
 @pytest.mark.parametrize("kind", ["buffer", "launch"])
 def test_masks_of_labels_are_the_same_on_the_cpu_device_that_took_over(device, gpu, labels, monkeypatch, kind):
     expected = mesh_arrays(*clrecon.extract_label_masks(labels, device=device).values())
-    Failing(monkeypatch, kind, 12, NEVER_LAST, label=gpu.label)
+    Failing(monkeypatch, kind, first=12, last=NEVER_LAST, label=gpu.label)
     found = mesh_arrays(*clrecon.extract_label_masks(labels, device=gpu).values())
     for one, other in zip(found, expected, strict=True):
         assert np.array_equal(one, other)
@@ -102,14 +103,14 @@ SMALL_WORK: dict[str, Callable] = {
 @pytest.mark.fault_row(54)
 @pytest.mark.parametrize("work", SMALL_WORK)
 def test_a_device_that_is_too_small_for_one_slice_hands_over(device, gpu, volume, work):
-    gpu.memory_bytes = 500
+    gpu.memory_bytes = 500  # of the 588 of a slice
     assert SMALL_WORK[work](volume, device=gpu).report["device"] == device.label
 
 
 @pytest.mark.fault_row(54)
 @pytest.mark.parametrize("work", SMALL_WORK)
 def test_memory_of_the_user_below_one_slice_is_refused_without_another_device(gpu, volume, work):
-    with refused(DeviceError, 400):
+    with refused(DeviceError, 400):  # of the 588 bytes of a slice
         SMALL_WORK[work](volume, device=gpu, memory=400)
     assert gpu.handed_over == []
 
@@ -117,7 +118,7 @@ def test_memory_of_the_user_below_one_slice_is_refused_without_another_device(gp
 @pytest.mark.fault_row(54)
 def test_a_device_that_the_user_named_fails_and_names_the_cpu_device(device, gpu, volume, monkeypatch):
     gpu.stand_in = None
-    Failing(monkeypatch, "buffer", 1, NEVER_LAST, label=gpu.label)
+    Failing(monkeypatch, "buffer", first=1, last=NEVER_LAST, label=gpu.label)
     cpu = max((each for each in list_devices() if each.type == "cpu"), key=lambda each: each.score)
     with refused(DeviceMemoryError, "injected") as caught:
         clrecon.extract_isosurface(volume, 100, device=gpu)
@@ -126,7 +127,7 @@ def test_a_device_that_the_user_named_fails_and_names_the_cpu_device(device, gpu
 
 @pytest.mark.fault_row(54)
 def test_a_cpu_device_never_hands_over(device, volume, monkeypatch):
-    Failing(monkeypatch, "buffer", 1, NEVER_LAST)
+    Failing(monkeypatch, "buffer", first=1, last=NEVER_LAST)
     with refused(DeviceMemoryError, "injected"):
         clrecon.extract_isosurface(volume, 100, device=device)
 
@@ -178,7 +179,7 @@ def test_a_lost_device_gets_a_fresh_context_and_gives_the_same_result(device, gp
         lost = gpu.context
         resident.close()
         with monkeypatch.context() as patch:
-            Failing(patch, "launch", 2 if work in SEVERAL_LAUNCHES else 1, label=gpu.label, error=lost_error())
+            Failing(patch, "launch", first=2 if work in SEVERAL_LAUNCHES else 1, label=gpu.label, error=lost_error())
             found = WORK[work](resident, labels)
         assert resident.device is gpu
         assert gpu.context is not lost
@@ -187,7 +188,7 @@ def test_a_lost_device_gets_a_fresh_context_and_gives_the_same_result(device, gp
 
 @pytest.mark.fault_row(56)
 def test_a_device_that_is_lost_again_hands_over_to_the_cpu_device_with_a_warning(device, gpu, volume, monkeypatch):
-    Failing(monkeypatch, "launch", 2, NEVER_LAST, label=gpu.label, error=lost_error())
+    Failing(monkeypatch, "launch", first=2, last=NEVER_LAST, label=gpu.label, error=lost_error())
     report = clrecon.extract_isosurface(volume, 100, device=gpu).report
     assert report["device"] == device.label
     assert [text for text in report["warnings"] if "INVALID_COMMAND_QUEUE" in text and "all was done on" in text]
@@ -195,7 +196,7 @@ def test_a_device_that_is_lost_again_hands_over_to_the_cpu_device_with_a_warning
 
 @pytest.mark.fault_row(56)
 def test_a_device_that_was_lost_once_is_warned_of(device, gpu, volume, monkeypatch):
-    Failing(monkeypatch, "launch", 2, label=gpu.label, error=lost_error())
+    Failing(monkeypatch, "launch", first=2, label=gpu.label, error=lost_error())
     report = clrecon.extract_isosurface(volume, 100, device=gpu).report
     assert report["device"] == gpu.label
     assert [text for text in report["warnings"] if "started again with a fresh context" in text]

@@ -192,4 +192,4 @@ def test_vertices_at_a_golden_section_of_each_edge_fail_the_bar_of_a_partial_vol
     crossed = np.argwhere(inside[:, :, :-1] != inside[:, :, 1:])
     vertices = crossed[:, ::-1] - 9.0 - (0.31, -0.17, 0.23) + (golden, 0.0, 0.0)
     error = np.linalg.norm(vertices, axis=1) - radius
-    assert np.sqrt(np.mean(error**2)) > 3 * tolerances.SPHERE_PARTIAL_VOLUME_RMS_VOXEL
+    assert np.sqrt(np.mean(error**2)) > 3 * tolerances.SPHERE_PARTIAL_VOLUME_RMS_VOXEL  # measured 4.6

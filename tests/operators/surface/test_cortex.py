@@ -248,6 +248,13 @@ def test_counts_of_the_states_of_a_fit_add_up_to_its_vertices(surface_with_vesse
     assert sum(fit.counts().values()) == mesh.vertex_count
 
 
+def constants_with_blurs(*, within_mm: float, across_mm: float) -> CortexConstants:
+    """Of a scan whose cortex has 1000 HU, to 50 HU."""
+    blurs = {"blur_mm": within_mm, "blur_across_mm": across_mm, "blur_error_mm": 0.02, "blur_across_error_mm": 0.05}
+    noise = {"noise_hu": 10.0, "residual_hu": 20.0}
+    return CortexConstants(**blurs, **noise, cortex_hu=1000.0, cortex_error_hu=50.0, places=500, thick=100)
+
+
 @pytest.mark.parametrize(
     ("cortex_hu", "state", "factor"),
     [
@@ -262,10 +269,15 @@ def test_walls_unlike_the_cortex_of_the_scan_have_errors_larger_by_a_factor_and_
     cortex_hu, state, factor
 ):
     """The cortex of the scan has 1000 HU: what a wall differs by is divided by 150 HU where that is above 1."""
-    constants = CortexConstants(0.7, 0.7, 1000.0, 0.02, 0.02, 50.0, 10.0, 20.0, 500, 100)
-    row = (0.0, 2.0, 50.0, cortex_hu, 250.0, 5.0, 1e-6, 900.0, 2.5)
-    wall = WallFits(*(np.array([value], np.float32) for value in row))
-    usual = WallFits(*(np.array([value], np.float32) for value in (*row[:3], 1000.0, *row[4:])))
+    constants = constants_with_blurs(within_mm=0.7, across_mm=0.7)
+
+    def wall_of(hu: float) -> WallFits:
+        plateaus = {"outer_hu": 50.0, "cortex_hu": hu, "inner_hu": 250.0, "peak_hu": 900.0}
+        lengths = {"shift_mm": 0.0, "thickness_mm": 2.0, "room_mm": 2.5}
+        fit = {**plateaus, **lengths, "residual_hu": 5.0, "shift_variance": 1e-6}
+        return WallFits(**{name: np.array([value], np.float32) for name, value in fit.items()})
+
+    wall, usual = wall_of(cortex_hu), wall_of(1000.0)
     (found_state,) = judge_walls(wall, constants, ProfileScale.of(hollow_ball()), np.zeros(1, bool))
     assert _STATES[found_state] == state
     # Float32.
@@ -273,7 +285,7 @@ def test_walls_unlike_the_cortex_of_the_scan_have_errors_larger_by_a_factor_and_
 
 
 THICK_SLICES = hollow_ball(thickness=1.0, spacing=(1.0, 1.0, 4.0))
-CONSTANTS_OF_THICK_SLICES = CortexConstants(0.7, 2.0, 1000.0, 0.02, 0.05, 50.0, 10.0, 20.0, 500, 100)
+CONSTANTS_OF_THICK_SLICES = constants_with_blurs(within_mm=0.7, across_mm=2.0)
 
 
 def test_thick_slices_hide_thin_walls_that_lie_across_them(device):
@@ -299,7 +311,7 @@ def test_thin_walls_alone_are_taken_for_thicker_and_less_dense_ones(device):
 
 def test_sheets_of_a_couch_around_a_shell_leave_the_constants_of_its_bone(device):
     """Sheets of 250 HU between air rise by more than bone does, and have more vertices."""
-    voxels = hollow_ball(thickness=3.0).voxels.copy()
+    voxels = hollow_ball(thickness=3.0, blur=0.7, cortex=1000.0).voxels.copy()
     for beside in (slice(0, 5), slice(-5, None)):
         voxels[:, :, beside] = -900
         voxels[:, beside] = -900
@@ -355,17 +367,18 @@ def test_the_less_dense_of_two_bones_is_found_nearer_to_the_truth_by_its_own_cor
 def test_a_scan_without_bone_is_refused(device):
     soft = hollow_ball(cortex=260.0, inner=260.0)
     with refused(NoSurfaceError, "walls", "bone"):
-        fit_surface(soft, device, 150.0)
+        fit_surface(soft, device, level=150.0)
 
 
 @pytest.mark.oclgrind
 def test_profiles_half_a_millimetre_outside_of_a_wall_find_it(device):
-    ways = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]])
-    points = MIDDLE + (OUTER_RADIUS + 0.5) * ways
-    with DeviceVolume(hollow_ball(), device=device) as resident:
+    directions = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]])
+    points = MIDDLE + (OUTER_RADIUS + 0.5) * directions
+    with DeviceVolume(hollow_ball(cortex=1000.0), device=device) as resident:
         sampler = ProfileSampler(resident, Stopwatch())
-        walls = sampler.take(sampler.values(points, ways)).fit(0.75, 0.75, 1000.0, 10.0)
-    assert walls.shift_mm == pytest.approx([-0.5] * 3, abs=0.15)
+        profiles = sampler.take(sampler.values(points, directions))
+        walls = profiles.fit(blur_mm=0.75, across_mm=0.75, cortex_hu=1000.0, noise_hu=10.0)
+    assert walls.shift_mm == pytest.approx([-0.5] * 3, abs=0.06)  # measured 0.03
 
 
 def test_walls_of_bone_reach_from_fit_to_fit_and_are_unknown_where_a_face_is_none(device):
@@ -375,7 +388,7 @@ def test_walls_of_bone_reach_from_fit_to_fit_and_are_unknown_where_a_face_is_non
     lengths = np.array([27.0, 27.0, 27.0, 27.0, np.nan, 0.2])
     with DeviceVolume(volume, device=device) as resident:
         constants = fit_surface(volume, device)[1].constants
-        points = MIDDLE + 13.5 * directions
+        points = MIDDLE + (OUTER_RADIUS + 0.5) * directions
         found = measure_bone_walls(points, directions, lengths, resident, constants, thin_mm=1.0)
-    np.testing.assert_allclose(found[:4], 26.0, atol=0.3)  # mm: a third of a voxel
+    np.testing.assert_allclose(found[:4], 2 * OUTER_RADIUS, atol=0.3)  # mm: a third of a voxel
     assert np.isnan(found[4:]).all()

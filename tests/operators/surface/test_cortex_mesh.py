@@ -22,7 +22,15 @@ from clrecon.opencl import Stopwatch
 from clrecon.opencl.launching import launch
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface import cortex, decimation
-from clrecon.operators.surface.cortex_mesh import CortexFit, calm_vertices, choose_shifts, find_turned, fit_walls
+from clrecon.operators.surface.cortex_mesh import (
+    _BADLY_FITTED,
+    FITTED,
+    CortexFit,
+    calm_vertices,
+    choose_shifts,
+    find_turned,
+    fit_walls,
+)
 from clrecon.operators.surface.extract import extract_isosurface
 
 RADIUS = 13.0  # of the outer surface of the shell, mm
@@ -33,7 +41,7 @@ def shell() -> Volume:
     """A shell of bone 3 mm thick with its outer surface at 13 mm, blurred by 0.7 mm, with noise of 20 HU."""
     k, j, i = np.indices((38, 40, 41))
     far = np.sqrt((i - MIDDLE[0]) ** 2 + (j - MIDDLE[1]) ** 2 + (k - MIDDLE[2]) ** 2)
-    outer, inner = ndtr((far - 13.0) / 0.7), ndtr((10.0 - far) / 0.7)
+    outer, inner = ndtr((far - RADIUS) / 0.7), ndtr((RADIUS - 3.0 - far) / 0.7)
     values = 50.0 * outer + 200.0 * inner + 1000.0 * (1.0 - outer - inner)
     values += np.random.default_rng(3).normal(0.0, 20.0, far.shape)
     return Volume(np.rint(values).astype(np.int16), np.eye(4))
@@ -125,10 +133,17 @@ def test_hidden_walls_follow_their_fitted_neighbours_three_vertices_far_and_othe
     rows, columns = np.indices((9, 9))
     corner = (9 * rows + columns)[:8, :8].ravel()
     triangles = np.concatenate([corner[:, None] + [0, 1, 10], corner[:, None] + [0, 10, 9]]).astype(np.uint32)
-    states = np.where(columns < 3, 0, 3).astype(np.uint8).ravel()
-    shift, spread = np.where(states == 0, -0.5, 9.0).astype(np.float32), np.full(81, 0.1, np.float32)
-    hidden, unused = (states == 3) & (rows < 5).ravel(), np.full(81, np.nan, np.float32)
-    fit = CortexFit(None, (), states, hidden, shift, unused, unused, spread, unused)
+    is_fitted = (columns < 3).ravel()
+    unused = np.full(81, np.nan, np.float32)
+    fit = CortexFit(
+        constants=None,
+        own_cortex_hu=(),
+        states=np.where(is_fitted, FITTED, _BADLY_FITTED).astype(np.uint8),
+        hidden=~is_fitted & (rows < 5).ravel(),
+        shift_mm=np.where(is_fitted, -0.5, 9.0).astype(np.float32),
+        spread_mm=np.full(81, 0.1, np.float32),
+        **dict.fromkeys(("thickness_mm", "error_mm", "room_mm"), unused),
+    )
 
     shifts = choose_shifts(fit, triangles, Fans(triangles, 81)).reshape(9, 9)
 

@@ -92,19 +92,21 @@ def test_crossings_with_a_changed_triangle_are_those_of_all_that_have_one(device
 )
 def test_two_spheres_have_the_crossing_pairs_of_the_host_at_any_scale(device, scale, shift):
     """Spheres of 10 units, the second shifted."""
-    vertices, triangles = samples.join(samples.sphere(rounds=3), samples.sphere(shift, 10.0, 3))
+    vertices, triangles = samples.join(samples.sphere(rounds=3), samples.sphere(centre=shift, radius=10.0, rounds=3))
     arrays = (scale * vertices).astype(np.float32), np.asarray(triangles, np.uint32)
     assert pairs(find_crossings(device, *arrays, fewest=1)) == pairs(find_self_intersections(*arrays))
 
 
 def test_two_spheres_that_cut_each_other_have_crossing_pairs(device):
-    vertices, triangles = samples.join(samples.sphere(rounds=3), samples.sphere((11.0, 4.0, -3.0), 10.0, 3))
+    vertices, triangles = samples.join(
+        samples.sphere(rounds=3), samples.sphere(centre=(11.0, 4.0, -3.0), radius=10.0, rounds=3)
+    )
     assert len(find_crossings(device, vertices.astype(np.float32), np.asarray(triangles, np.uint32), fewest=1)) > 0
 
 
 def test_no_triangle_of_a_torus_is_marked(device):
     """Neighbours share vertices, and what lies farther is told apart in float32."""
-    vertices, triangles = samples.torus(120, 60)
+    vertices, triangles = samples.torus(rings=120, sides=60)
     found = mark_crossings(device, plan_crossings(vertices.astype(np.float32), np.asarray(triangles, np.uint32)))
     assert not found.any()
 

@@ -53,7 +53,7 @@ def test_vertices_in_float64_are_warned_of(device, shift, warned):
 
 @pytest.mark.every_device
 def test_vertices_far_from_the_origin_lie_on_their_sphere(device):
-    volume = make_sphere(FAR, "float32")
+    volume = make_sphere(FAR, dtype="float32")
     mesh = extract_isosurface(volume, 0.0, device=device)
     centre = volume.ijk_to_lps(CENTRE_IJK[None])[0]
     radius = np.linalg.norm(mesh.vertices - centre, axis=1)
@@ -62,7 +62,7 @@ def test_vertices_far_from_the_origin_lie_on_their_sphere(device):
 
 @pytest.mark.every_device
 def test_surface_far_from_the_origin_equals_the_twin(device):
-    volume = make_sphere(FAR, "float32")
+    volume = make_sphere(FAR, dtype="float32")
     mesh = extract_isosurface(volume, 0.0, device=device)
     vertices, normals, triangles = twin.extract_isosurface(volume, 0.0)
     assert np.array_equal(mesh.triangles, triangles)
@@ -122,7 +122,7 @@ def near_and_far(device):
 
 
 def refine(mesh: Mesh) -> Mesh:
-    return clrecon.decimate_mesh(clrecon.smooth_mesh(mesh), 0.7)
+    return clrecon.decimate_mesh(clrecon.smooth_mesh(mesh), fraction=0.7)
 
 
 @pytest.mark.parametrize("change", [lambda mesh: mesh, refine], ids=["extracted", "refined"])

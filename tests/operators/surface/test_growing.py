@@ -79,7 +79,7 @@ def test_surface_grown_in_random_voxels_equals_the_twin_at_sizes_of_words(
 ) -> None:
     if np.prod(shape) > 10_000:
         shape = (2, 2, shape[2])
-    assert_grown_surface_equals_twin(random_volume(shape, high=9), device, 7)
+    assert_grown_surface_equals_twin(random_volume(shape, high=9), device, level=7)
 
 
 @pytest.mark.parametrize("closed", [True, False])
@@ -89,28 +89,28 @@ def test_grown_surface_closed_or_open_above_or_below_a_level_equals_the_twin(
     affine: Any, closed: bool, below: bool, device: Any
 ) -> None:
     volume = random_volume((6, 9, 40), high=9, affine=affine)
-    assert_grown_surface_equals_twin(volume, device, 2, closed=closed, below=below)
+    assert_grown_surface_equals_twin(volume, device, level=2, closed=closed, below=below)
 
 
 @pytest.mark.parametrize("dtype", daily(1, ["uint8", "float32"]))
 def test_grown_surface_of_a_range_equals_the_twin(dtype: str, device: Any) -> None:
-    assert_grown_surface_equals_twin(random_volume((6, 9, 40), dtype, high=9), device, (2, 4))
+    assert_grown_surface_equals_twin(random_volume((6, 9, 40), dtype=dtype, high=9), device, level=(2, 4))
 
 
 @pytest.mark.parametrize("dtype", daily(1, ["uint8", "float32"]))
 def test_grown_surface_of_uneven_slices_equals_the_twin(dtype: str, device: Any) -> None:
-    assert_grown_surface_equals_twin(uneven(random_volume((6, 9, 40), dtype, high=9).voxels), device, 7)
+    assert_grown_surface_equals_twin(uneven(random_volume((6, 9, 40), dtype=dtype, high=9).voxels), device, level=7)
 
 
 def test_grown_surface_by_the_golden_search_equals_the_twin(device: Any) -> None:
-    assert_grown_surface_equals_twin(smooth_volume((9, 10, 40)), device, 100, vertex_rule="golden-search")
+    assert_grown_surface_equals_twin(smooth_volume((9, 10, 40)), device, level=100, vertex_rule="golden-search")
 
 
 @pytest.mark.release
 def test_cells_grown_on_a_spine_of_many_components_are_those_of_the_twin(device: Any) -> None:
     voxels, affine, _ = make_phantom(PhantomSettings(size=(64, 64), slices=24, spacing=(2.4, 2.4, 3.3), noise=40.0))
     volume = Volume(voxels, affine)
-    assert_grown_surface_equals_twin(volume, device, 226)
+    assert_grown_surface_equals_twin(volume, device, level=226)
     assert extract_isosurface(volume, 226, device=device, grow_from="auto").report["growing"]["components"] > 10
 
 
@@ -156,7 +156,7 @@ def test_a_mask_of_fewer_slices_is_refused_as_a_seed(voxel_of_small_block: np.nd
 
 @pytest.mark.oclgrind
 def test_surface_grown_in_a_small_volume_equals_the_twin(device: Any) -> None:
-    assert_grown_surface_equals_twin(random_volume((3, 5, 33), high=9), device, 7)
+    assert_grown_surface_equals_twin(random_volume((3, 5, 33), high=9), device, level=7)
 
 
 def chosen_of_whole(whole: Any, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -182,7 +182,7 @@ def test_a_grown_component_is_that_of_the_whole_mesh_bit_for_bit(seed: Any, in_h
     assert np.array_equal(grown.vertices, vertices)
     assert np.array_equal(grown.triangles, triangles)
     growing = grown.report["growing"]
-    assert (growing["components"], growing["components_taken"]) == (4, 1)
+    assert (growing["components"], growing["components_taken"]) == (4, 1)  # three blocks and a hollow
 
 
 @pytest.mark.parametrize(("seed", "in_hollow"), [(OUTSIDE_IJK, False), (HOLLOW_IJK, True)], ids=["outside", "hollow"])
@@ -211,7 +211,7 @@ def test_growing_from_auto_leaves_the_lone_voxel_out_and_reports_its_cells(devic
     assert_sound(mesh)
     growing = mesh.report["growing"]
     assert growing["from"] == ["auto"]
-    assert growing["components_taken"] == 3
+    assert growing["components_taken"] == 3  # two blocks and a hollow
     assert growing["largest_left_out_cells"] == CELLS_OF_A_VOXEL
     assert growing["cells_left_out_share"] == pytest.approx(CELLS_OF_A_VOXEL / mesh.report["cells"]["active"])
 
@@ -373,4 +373,4 @@ def test_vertices_at_a_golden_section_lie_ten_times_farther_off_than_linear_ones
 
 
 def test_vertices_by_a_golden_search_lie_nearly_as_well_as_linear_ones(rms_by_rule: dict[str, float]) -> None:
-    assert rms_by_rule["golden-search"] == pytest.approx(rms_by_rule["linear"], abs=0.03)  # measured 0.005 apart
+    assert rms_by_rule["golden-search"] == pytest.approx(rms_by_rule["linear"], abs=0.01)  # measured 0.005 apart

@@ -8,6 +8,7 @@ import tolerances
 from refusals import refused
 from scipy.spatial import cKDTree
 from slab_surfaces import assert_same
+from surface_volumes import MIRRORED, OBLIQUE, random_labels
 from variants import daily, daily_rows
 
 from clrecon.errors import DeviceError, RefusedInputError, UsageError
@@ -19,18 +20,7 @@ from clrecon.opencl import Stopwatch
 from clrecon.operators.surface.label_masks import extract_label_masks, survey_labels
 from clrecon.proof.surface import labels as twin
 
-OBLIQUE = np.array([[0.7, 0.1, 0.05, -250.0], [-0.1, 0.5, 0.2, -300.0], [0.0, 0.05, 2.5, -846.0], [0, 0, 0, 1.0]])
-MIRRORED = OBLIQUE @ np.diag((-1.0, 1.0, 1.0, 1.0))
 SHAPES = [(5, 7, 9), (1, 4, 31), (5, 1, 33), (6, 5, 64), (4, 5, 100), (3, 4, 1030)]
-
-
-def random_labels(shape, seed=1, numbers=(0, 0, 3, 7, 300)) -> np.ndarray:
-    """Blocks of labels, and single voxels of others."""
-    random = np.random.default_rng(seed)
-    coarse = random.choice(np.array(numbers, np.uint16), [-(-n // 3) for n in shape])
-    labels = coarse.repeat(3, 0).repeat(3, 1).repeat(3, 2)[: shape[0], : shape[1], : shape[2]]
-    odd = random.random(shape) < 0.1
-    return np.where(odd, random.choice(np.array(numbers, np.uint16), shape), labels)
 
 
 def distances_from(shape, centre) -> np.ndarray:
@@ -132,7 +122,7 @@ def test_survey_of_a_single_label_finds_its_box_and_counts_no_faces(device, memo
     labels = random_labels((5, 6, 40), numbers=(0, 0, 4))
     boxes, faces = survey_labels(LabelMap(labels, np.eye(4)), device, memory, Stopwatch())
     assert boxes == find_boxes(labels, (4,), (0, 0, 0))
-    assert faces.tolist() == [[0, 0]] * 5
+    assert faces.tolist() == [[0, 0]] * 5  # of each number up to 4
 
 
 def crossed_edges(mask: np.ndarray) -> np.ndarray:
@@ -371,8 +361,8 @@ def test_labels_of_which_one_encloses_the_other_keep_their_volumes(device, radiu
 def test_a_label_within_another_has_a_lower_level_and_the_same_surface_alone(device, radius):
     labels = LabelMap(ball_within_a_ball(radius), OBLIQUE)
     meshes = extract_label_masks(labels, device=device)
-    levels = [meshes[number].report["mask_level"] for number in (2, 1)]
-    assert levels[0] < levels[1] - 0.05  # measured 0.35 and 0.20, for the smaller ball, below 0.46
+    outer, inner = (meshes[number].report["mask_level"] for number in (1, 2))
+    assert inner < outer - 0.05  # measured 0.35 and 0.20, for the smaller ball, below 0.46
     alone = extract_label_masks(labels, device=device, label=[2])[2]
     assert np.array_equal(alone.vertices, meshes[2].vertices)
 
@@ -445,7 +435,8 @@ def test_no_groove_runs_along_the_border_of_two_labels(device):
     labels[:8, :, :20], labels[:8, :, 20:] = 1, 2
     meshes = extract_label_masks(LabelMap(labels, np.eye(4)), device=device)
     heights = np.concatenate([meshes[number].vertices[:, 2] for number in (1, 2)])
-    assert np.ptp(heights[heights > 7.001]) < 0.02  # mm; measured 0
+    tops = heights[heights > 7.001]  # above the last slice
+    assert np.ptp(tops) < 0.02  # mm; measured 0
 
 
 def test_a_gap_of_one_voxel_between_two_labels_stays_open(device):
@@ -504,7 +495,7 @@ def test_every_variant_of_the_kernels_gives_the_same_meshes(device, lanes, words
 def lung_mesh(device):
     """The mesh of a label named lung, a ball of 3 voxels in voxels of 1 x 1 x 2 mm, of a doubtful map."""
     labels = ball_mask((9, 9, 9), 3.0).astype(np.uint8)
-    label_map = LabelMap(labels, np.diag([1.0, 1.0, 2.0, 1.0]), {1: "lung"}, warnings=["doubtful"])
+    label_map = LabelMap(labels, np.diag([1.0, 1.0, 2.0, 1.0]), names={1: "lung"}, warnings=["doubtful"])
     return np.count_nonzero(labels), extract_label_masks(label_map, device=device, label=["lung"])[1]
 
 

@@ -7,6 +7,7 @@ import pytest
 import tolerances
 from refusals import refused
 from slab_surfaces import assert_same
+from surface_volumes import MIRRORED, OBLIQUE, random_labels, random_volume
 from variants import VOXEL_TYPES, daily
 
 from clrecon.errors import DeviceError, NoSurfaceError, RefusedInputError, UsageError
@@ -22,22 +23,7 @@ from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.operators.surface.labels import extract_labels
 from clrecon.proof.surface import labels as twin
 
-OBLIQUE = np.array([[0.7, 0.1, 0.05, -250.0], [-0.1, 0.5, 0.2, -300.0], [0.0, 0.05, 2.5, -846.0], [0, 0, 0, 1.0]])
-MIRRORED = OBLIQUE @ np.diag((-1.0, 1.0, 1.0, 1.0))
 SHAPES = [(5, 7, 9), (6, 5, 31), (5, 6, 33), (9, 4, 64), (4, 5, 100), (3, 4, 1030)]
-
-
-def random_volume(shape, dtype="int16", affine=OBLIQUE, seed=0, high=6) -> Volume:
-    return Volume(np.random.default_rng(seed).integers(0, high, shape).astype(dtype), affine)
-
-
-def random_labels(shape, seed=1, numbers=(0, 0, 3, 7, 300)) -> np.ndarray:
-    """Blocks of labels, and single voxels of others."""
-    random = np.random.default_rng(seed)
-    coarse = random.choice(np.array(numbers, np.uint16), [-(-n // 3) for n in shape])
-    labels = coarse.repeat(3, 0).repeat(3, 1).repeat(3, 2)[: shape[0], : shape[1], : shape[2]]
-    odd = random.random(shape) < 0.1
-    return np.where(odd, random.choice(np.array(numbers, np.uint16), shape), labels)
 
 
 def assert_equals_twin(mesh, volume, inside, number, iso_value, closed=True):
@@ -72,7 +58,7 @@ def test_surfaces_of_labels_and_their_share_placed_by_hu_equal_the_twin(device, 
     )
     assert tuple(meshes) == numbers
     for number, mesh in meshes.items():
-        assert_equals_twin(mesh, volume, inside, number, 3, closed)
+        assert_equals_twin(mesh, volume, inside, number, 3, closed=closed)
         if closed:
             by_hu = share_placed_by_hu(volume, inside, number, 3, len(mesh.vertices))
             assert mesh.report["vertices_by_hu_share"] == pytest.approx(by_hu, abs=tolerances.FLOAT64_SHARE)
@@ -82,7 +68,7 @@ def test_surfaces_of_labels_and_their_share_placed_by_hu_equal_the_twin(device, 
 @pytest.mark.parametrize("iso_value", [40, 40.3])
 def test_surfaces_of_labels_equal_their_twin_for_every_voxel_type(device, dtype, iso_value):
     shape = (6, 7, 37)
-    volume, labels = random_volume(shape, dtype, MIRRORED, high=100), random_labels(shape)
+    volume, labels = random_volume(shape, dtype=dtype, high=100, affine=MIRRORED), random_labels(shape)
     inside = twin.find_solid(volume, labels, iso_value)
     meshes = extract_labels(volume, LabelMap(labels, MIRRORED), iso_value, device=device)
     assert tuple(meshes) == (3, 7, 300)
@@ -113,7 +99,7 @@ def test_samples_that_labels_grow_to_equal_the_twin(device, shape, affine, grow_
     growth = Growth.of(volume, grow_mm)
     taken = resample_labels(LabelMap(labels, affine), volume)
     resident = DeviceVolume(volume, device=device)
-    run = operator.LabelExtraction(resident, taken, choose_iso_rule(volume, 3), growth, False, [])
+    run = operator.LabelExtraction(resident, taken, choose_iso_rule(volume, 3), growth, solid=False, warnings=[])
 
     held = run.hold({1: (slice(0, shape[0]), slice(0, shape[1]), slice(0, shape[2]))})
 
@@ -218,7 +204,7 @@ def test_labels_on_a_turned_grid_of_the_same_voxels_have_the_same_surfaces(devic
 def report_of_t12(device):
     """The report of the surface of a label named after its vertebra, in a doubtful map."""
     volume, labels = random_volume((5, 7, 9)), random_labels((5, 7, 9))
-    label_map = LabelMap(labels, OBLIQUE, {3: "vertebrae_T12"}, warnings=["doubtful"])
+    label_map = LabelMap(labels, OBLIQUE, names={3: "vertebrae_T12"}, warnings=["doubtful"])
     return extract_labels(volume, label_map, 3, device=device, label=["T12"])[3].report
 
 
@@ -249,10 +235,10 @@ def test_a_label_that_leaves_the_volume_is_closed_at_its_end_with_a_warning(devi
 @pytest.fixture(scope="module")
 def liver_and_bone() -> tuple[Volume, LabelMap]:
     """Label 2, the liver, of 1 HU in the first slice, and label 5 with 0 to 5 HU in the last two."""
-    volume, labels = random_volume((5, 7, 9)), np.zeros((5, 7, 9), np.uint8)
+    volume, labels = random_volume((5, 7, 9), high=6), np.zeros((5, 7, 9), np.uint8)
     labels[0], labels[3:] = 2, 5
     volume.voxels[:3] = 1
-    return volume, LabelMap(labels, OBLIQUE, {2: "liver"})
+    return volume, LabelMap(labels, OBLIQUE, names={2: "liver"})
 
 
 def test_a_label_without_a_surface_is_left_out_where_all_are_asked_for(device, liver_and_bone):
@@ -297,7 +283,7 @@ def block_in_a_label_of_all() -> tuple[Volume, LabelMap]:
     """A block of 300 HU in 0 HU, and a label of all voxels."""
     hu = np.zeros((5, 7, 9), np.int16)
     hu[2:4, 2:5, 2:6] = 300
-    return Volume(hu, OBLIQUE), LabelMap(np.ones((5, 7, 9), np.uint8), OBLIQUE, {1: "all"})
+    return Volume(hu, OBLIQUE), LabelMap(np.ones((5, 7, 9), np.uint8), OBLIQUE, names={1: "all"})
 
 
 @pytest.mark.parametrize("chosen", [None, [1]])
@@ -427,6 +413,6 @@ def test_a_volume_that_is_held_is_used_whole_where_a_mesh_of_half_the_bytes_fits
         resident.whole(Stopwatch())
         rule, growth = choose_iso_rule(volume, 3), Growth.of(volume, 1.0)
         taken = resample_labels(LabelMap(labels, np.eye(4)), volume)
-        run = operator.LabelExtraction(resident, taken, rule, growth, False, [])
+        run = operator.LabelExtraction(resident, taken, rule, growth, solid=False, warnings=[])
         assert sum(run.needs(0, 40).values()) == 4 * volume.voxels.size
         assert run.slices_for({1: (slice(20, 22), slice(1, 4), slice(2, 6))}) == slices

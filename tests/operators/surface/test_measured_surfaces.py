@@ -27,7 +27,7 @@ TILTED[:3, 3] = (-120.0, 80.0, -700.0)
 
 
 def tilted_field() -> Volume:
-    return smooth_volume((17, 20, 24), TILTED)
+    return smooth_volume((17, 20, 24), affine=TILTED)
 
 
 def uneven_field() -> Volume:
@@ -43,12 +43,12 @@ def active_cells(volume: Volume, level: float) -> set[tuple[int, ...]]:
     return set(map(tuple, (np.argwhere((count > 0) & (count < 8))[:, ::-1] - 1).tolist()))
 
 
-@pytest.mark.parametrize("made", [tilted_field, uneven_field])
+@pytest.mark.parametrize("make_field", [tilted_field, uneven_field])
 @pytest.mark.parametrize("rule", ["linear", "golden"])
 def test_cells_of_a_surface_are_those_with_corners_on_both_sides_of_its_level(
-    made: Any, rule: str, device: Any
+    make_field: Any, rule: str, device: Any
 ) -> None:
-    volume = made()
+    volume = make_field()
     mesh = extract_isosurface(volume, 100, device=device, vertex_rule=rule)
     assert set(map(tuple, find_mesh_cells(mesh, volume).ijk.tolist())) == active_cells(volume, 100)
 

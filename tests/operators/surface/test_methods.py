@@ -26,16 +26,16 @@ def sorted_corners(mesh: Any) -> np.ndarray:
 
 
 @pytest.fixture(params=[OBLIQUE, MIRRORED], ids=["oblique", "mirrored"])
-def smooth(request: pytest.FixtureRequest) -> Any:
-    return smooth_volume((9, 10, 24), request.param)
+def smooth_field(request: pytest.FixtureRequest) -> Any:
+    return smooth_volume((9, 10, 24), affine=request.param)
 
 
 @pytest.mark.parametrize("closed", [True, False])
 def test_welded_triangle_soup_has_the_vertices_and_cells_of_marching_cubes(
-    smooth: Any, closed: bool, device: Any
+    smooth_field: Any, closed: bool, device: Any
 ) -> None:
-    soup = extract_by_method(smooth, 100.5, "t-mc-soup", closed=closed)
-    whole = extract_by_method(smooth, 100.5, "t-mc", closed=closed, device=device)
+    soup = extract_by_method(smooth_field, 100.5, "t-mc-soup", closed=closed)
+    whole = extract_by_method(smooth_field, 100.5, "t-mc", closed=closed, device=device)
     assert (soup.vertex_count, soup.triangle_count) == (whole.vertex_count, whole.triangle_count)
     off = np.abs(np.sort(soup.vertices, 0) - np.sort(whole.vertices, 0)).max()
     assert off < 8 * float32_unit(whole.vertices)  # sums of four rounded products
@@ -45,10 +45,10 @@ def test_welded_triangle_soup_has_the_vertices_and_cells_of_marching_cubes(
 
 @pytest.mark.parametrize("closed", [True, False])
 def test_welded_triangle_soup_is_as_closed_as_marching_cubes_with_its_volume(
-    smooth: Any, closed: bool, device: Any
+    smooth_field: Any, closed: bool, device: Any
 ) -> None:
-    soup = extract_by_method(smooth, 100.5, "t-mc-soup", closed=closed).quality()
-    whole = extract_by_method(smooth, 100.5, "t-mc", closed=closed, device=device).quality()
+    soup = extract_by_method(smooth_field, 100.5, "t-mc-soup", closed=closed).quality()
+    whole = extract_by_method(smooth_field, 100.5, "t-mc", closed=closed, device=device).quality()
     assert soup["closed"] == whole["closed"] == closed
     assert soup["manifold"]
     assert soup["volume_ml"] == pytest.approx(whole["volume_ml"], rel=1e-4)  # float32
@@ -67,12 +67,12 @@ def test_surface_by_scikit_image_has_the_volume_and_area_of_the_trilinear_topolo
     affine: np.ndarray | None, device: Any
 ) -> None:
     pytest.importorskip("skimage")
-    volume = uneven(smooth_volume((6, 12, 20)).voxels) if affine is None else smooth_volume((12, 14, 24), affine)
+    volume = uneven(smooth_volume((6, 12, 20)).voxels) if affine is None else smooth_volume((12, 14, 24), affine=affine)
     theirs = extract_by_method(volume, 100.5, "skimage").quality()
     ours = extract_isosurface(volume, 100.5, device=device, topology="trilinear").quality()
     assert theirs["volume_ml"] > 0  # wound outward
-    assert theirs["volume_ml"] == pytest.approx(ours["volume_ml"], rel=0.02)  # measured 0.001
-    assert theirs["area_mm2"] == pytest.approx(ours["area_mm2"], rel=0.02)  # measured 2e-4
+    assert theirs["volume_ml"] == pytest.approx(ours["volume_ml"], rel=0.002)  # measured 0.001
+    assert theirs["area_mm2"] == pytest.approx(ours["area_mm2"], rel=5e-4)  # measured 2e-4
 
 
 def test_method_i_mc_grows_a_sound_surface_from_the_largest_component(device: Any) -> None:
@@ -90,8 +90,7 @@ def test_method_s_mc_decimates_and_reports_it(device: Any) -> None:
 def test_method_g_mc_removes_the_share_of_triangles_that_is_asked_for(device: Any) -> None:
     whole = extract_isosurface(smooth_volume(), 250, device=device)
     decimated = extract_by_method(smooth_volume(), 250, "g-mc", decimate=0.3, device=device)
-    # A collapse takes two; measured 0.0001.
-    assert decimated.triangle_count == pytest.approx((1 - 0.3) * whole.triangle_count, rel=0.02)
+    assert decimated.triangle_count == pytest.approx((1 - 0.3) * whole.triangle_count, abs=2)  # a collapse takes two
 
 
 @pytest.mark.parametrize(

@@ -50,7 +50,7 @@ def ball(radius: float, size: int = 33) -> Volume:
 @pytest.mark.parametrize(("level", "options"), CASES)
 def test_surface_of_a_range_equals_its_twin_for_voxel_types(device, dtype, affine, level, options):
     """Of whole numbers one of each kind: with a sign, without one, and beyond what float32 holds."""
-    volume = random_volume((5, 6, 37), dtype, high=100, affine=affine)
+    volume = random_volume((5, 6, 37), dtype=dtype, high=100, affine=affine)
     assert_equals_twin(volume, level, device, **options)
 
 
@@ -75,13 +75,13 @@ def test_surfaces_of_random_integers_below_every_level_and_in_every_range_are_so
 
 @pytest.mark.parametrize("band", [(1.0, 2.0), (0.5, 2.0), (1.0, 2.5), (0.0, 1.0)])
 def test_surfaces_of_random_floats_in_ranges_are_sound(device, band):
-    assert_sound(extract_isosurface(random_volume((7, 8, 40), "float32", 4), band, device=device))
+    assert_sound(extract_isosurface(random_volume((7, 8, 40), dtype="float32", high=4), band, device=device))
 
 
 @pytest.mark.parametrize("dtype", ["int16", "float32"])
 @pytest.mark.parametrize("topology", ["separated", "trilinear"])
 def test_open_surface_below_a_level_is_that_of_the_iso_value_with_faces_and_normals_reversed(device, dtype, topology):
-    volume = random_volume((7, 9, 40), dtype, high=50)
+    volume = random_volume((7, 9, 40), dtype=dtype, high=50)
     above = extract_isosurface(volume, 20, device=device, closed=False, topology=topology)
     below = extract_isosurface(volume, 20, device=device, closed=False, topology=topology, below=True)
     assert np.array_equal(below.vertices, above.vertices)
@@ -153,8 +153,8 @@ def test_surface_below_a_level_of_an_empty_volume_ends_half_a_voxel_beyond_it(de
 @pytest.mark.parametrize("dtype", ["int16", "uint8", "float32"])
 @pytest.mark.parametrize("slices", [1, 2, 3, 5])
 def test_slabs_of_any_thickness_give_the_same_surface_of_a_range(device, dtype, level, options, slices):
-    volume = random_volume((9, 7, 40), dtype, affine=MIRRORED if dtype == "uint8" else OBLIQUE)
-    mesh = extract_in_slabs(volume, level, device, slices, **options)
+    volume = random_volume((9, 7, 40), dtype=dtype, affine=MIRRORED if dtype == "uint8" else OBLIQUE)
+    mesh = extract_in_slabs(volume, level, device, slices=slices, **options)
     assert mesh.report["slabs"] == -(-(9 + 2) // slices)  # with a border at both ends
     assert_same(mesh, extract_isosurface(volume, level, device=device, **options))
 
@@ -230,7 +230,7 @@ def test_levels_that_are_no_range_are_refused(device, level, options, said):
         extract_isosurface(random_volume((3, 4, 5), high=500), level, device=device, **options)
 
 
-SMALL = random_volume((5, 6, 7))  # whole HU from 0 to 5
+SMALL = random_volume((5, 6, 7), high=6)  # whole HU from 0 to 5
 
 
 @pytest.mark.parametrize("level", [(8, 9), (-9, -8), (3.2, 3.8), (40_000, 50_000)])
@@ -255,7 +255,7 @@ def test_a_surface_below_the_lowest_value_is_refused(device):
 
 def test_a_range_whose_ends_are_one_number_of_float32_is_refused(device):
     with refused(UsageError, "float32"):
-        extract_isosurface(random_volume((3, 4, 5), "float32"), (1.0, 1.0 + 1e-12), device=device)
+        extract_isosurface(random_volume((3, 4, 5), dtype="float32"), (1.0, 1.0 + 1e-12), device=device)
 
 
 def test_a_device_that_finds_no_surface_of_a_range_where_one_must_be_is_refused(device, monkeypatch):
@@ -296,7 +296,7 @@ def test_surface_of_a_range_in_a_small_volume_equals_the_twin(device, shape, lev
 
 @pytest.mark.parametrize("dtype", ["int16", "float32"])
 def test_a_range_without_an_upper_end_has_the_surface_of_its_lower_end(device, dtype):
-    volume = random_volume((5, 6, 37), dtype, high=100)
+    volume = random_volume((5, 6, 37), dtype=dtype, high=100)
     assert_same(extract_isosurface(volume, (40, None), device=device), extract_isosurface(volume, 40, device=device))
 
 
@@ -304,7 +304,7 @@ def test_a_range_without_an_upper_end_has_the_surface_of_its_lower_end(device, d
     ("dtype", "next_value"), [("int16", 41), ("float32", np.nextafter(np.float32(40), np.float32(np.inf)))]
 )
 def test_a_range_without_a_lower_end_has_the_surface_below_the_next_value(device, dtype, next_value):
-    volume = random_volume((5, 6, 37), dtype, high=100)
+    volume = random_volume((5, 6, 37), dtype=dtype, high=100)
     up_to = extract_isosurface(volume, (None, 40), device=device)
     assert_same(up_to, extract_isosurface(volume, next_value, below=True, device=device))
 

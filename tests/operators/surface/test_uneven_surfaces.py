@@ -50,7 +50,7 @@ RADIUS = 10.0
 @pytest.fixture(scope="module")
 def sphere_in_uneven_slices():
     """The distance field of a sphere of 10 mm."""
-    return make_volume(lambda p: RADIUS - np.linalg.norm(p, axis=1), (66, 50))
+    return make_volume(lambda p: RADIUS - np.linalg.norm(p, axis=1), shape=(66, 50))
 
 
 def off_sphere(mesh, volume) -> np.ndarray:
@@ -68,7 +68,7 @@ def test_surface_of_a_sphere_in_uneven_slices_is_closed_with_its_volume(device, 
     quality = extract_isosurface(sphere_in_uneven_slices, 0.0, device=device).quality()
     assert (quality["closed"], quality["manifold"], quality["genus"]) == (True, True, 0)
     exact_ml = 4 / 3 * np.pi * RADIUS**3 / 1000
-    assert 0.96 * exact_ml < quality["volume_ml"] < exact_ml  # measured 0.994 of it
+    assert 0.985 * exact_ml < quality["volume_ml"] < exact_ml  # measured 0.994 of it
 
 
 def test_surface_of_the_same_slices_at_even_places_is_no_sphere(device, sphere_in_uneven_slices):
@@ -80,7 +80,7 @@ def test_surface_of_the_same_slices_at_even_places_is_no_sphere(device, sphere_i
 @pytest.mark.oclgrind
 def test_trilinear_surface_of_a_few_uneven_slices_equals_the_twin(device):
     rng = np.random.default_rng(13)
-    volume = make_volume(lambda p: rng.integers(-500, 500, len(p)), (4, 9), GAPS[7:11], dtype=np.int16)
+    volume = make_volume(lambda p: rng.integers(-500, 500, len(p)), shape=(4, 9), gaps=GAPS[7:11], dtype=np.int16)
     mesh = extract_isosurface(volume, 25, device=device, topology="trilinear")
     vertices, _, triangles = extract_twin(volume, 25, topology="trilinear")
     assert np.array_equal(mesh.triangles, triangles)
@@ -103,7 +103,7 @@ def test_surface_of_a_linear_field_in_uneven_slices_is_a_plane_with_its_normal(d
 @pytest.mark.parametrize("dtype", [np.int16, np.float32])
 def test_surfaces_of_uneven_slices_equal_the_twin(device, topology, closed, dtype):
     rng = np.random.default_rng(11)
-    volume = make_volume(lambda p: rng.integers(-500, 500, len(p)), (9, 11), GAPS[5:15], dtype=dtype)
+    volume = make_volume(lambda p: rng.integers(-500, 500, len(p)), shape=(9, 11), gaps=GAPS[5:15], dtype=dtype)
     mesh = extract_isosurface(volume, 25, device=device, closed=closed, topology=topology)
     vertices, normals, triangles = extract_twin(volume, 25, closed=closed, topology=topology)
     assert np.array_equal(mesh.triangles, triangles)
@@ -128,7 +128,7 @@ def test_a_thin_layer_does_not_move_a_plane_in_another_layer(device, share):
 @pytest.mark.parametrize("topology", ["separated", "trilinear"])
 def test_surface_through_a_thin_layer_equals_the_twin(device, topology):
     rng = np.random.default_rng(12)
-    volume = make_volume(lambda p: rng.integers(-500, 500, len(p)), (9, 11), THIN[5:15], noise=0.0)
+    volume = make_volume(lambda p: rng.integers(-500, 500, len(p)), shape=(9, 11), gaps=THIN[5:15], noise=0.0)
     mesh = extract_isosurface(volume, 25, device=device, topology=topology)
     vertices, _, triangles = extract_twin(volume, 25, topology=topology)
     assert np.array_equal(mesh.triangles, triangles)
@@ -140,9 +140,9 @@ def test_surface_through_a_thin_layer_equals_the_twin(device, topology):
 def test_slabs_of_uneven_slices_give_the_same_surface_bit_for_bit(device, slices):
     rng = np.random.default_rng(12)
     shape, gaps = ((4, 9), GAPS[7:11]) if device.is_simulator else ((9, 70), GAPS[5:15])
-    volume = make_volume(lambda p: rng.integers(-500, 500, len(p)), shape, gaps, dtype=np.int16)
+    volume = make_volume(lambda p: rng.integers(-500, 500, len(p)), shape=shape, gaps=gaps, dtype=np.int16)
     whole = extract_isosurface(volume, 10, device=device)
-    assert_same(extract_in_slabs(volume, 10, device, slices), whole)
+    assert_same(extract_in_slabs(volume, 10, device, slices=slices), whole)
 
 
 def test_distances_to_a_plane_in_uneven_slices_are_those_of_analysis():
@@ -163,7 +163,7 @@ def test_distances_to_a_plane_in_uneven_slices_are_those_of_analysis():
 def ball_with_fine_labels(device):
     """A ball of 7 mm in uneven slices, its surface, and that of its label on an even map of 0.4 mm."""
     radius, step = 7.0, 0.4
-    volume = make_volume(lambda p: 40.0 * (radius - np.linalg.norm(p, axis=1)), (60, 50), dtype=np.int16)
+    volume = make_volume(lambda p: 40.0 * (radius - np.linalg.norm(p, axis=1)), shape=(60, 50), dtype=np.int16)
     affine = np.diag([step, step, step, 1.0])
     affine[:3, 3] = centre_of(volume) - step * 30
     k, j, i = np.mgrid[:61, :61, :61]

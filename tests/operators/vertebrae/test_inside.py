@@ -28,9 +28,10 @@ SPINE = PhantomSettings(levels="L1-L2", size=(190, 190), spacing=(0.7, 0.7, 1.0)
 
 @pytest.fixture(scope="module")
 def spine():
+    """A phantom of L1 and L2, and the labels of its truth."""
     voxels, affine, _ = make_phantom(SPINE)
     truth = clrecon.phantom_truth(SPINE)
-    return Volume(voxels, affine), LabelMap(truth.label_map(), affine, truth.names)
+    return Volume(voxels, affine), LabelMap(truth.label_map(), affine, names=truth.names)
 
 
 def truth_of(volume, affine, name):
@@ -52,7 +53,7 @@ VOXEL_ML = 0.7 * 0.7 * 1.0 / 1000
 def inside_at_400(spine, device):
     """L1 of the phantom, its solid grown to 400 HU; its true cortex and canal."""
     volume, labels = spine
-    inside = clrecon.vertebra_inside(volume, labels, "L1", 400, device=device)
+    inside = clrecon.vertebra_inside(volume, labels, "L1", iso_value=400, device=device)
     return inside, *truth_of(inside.volume, volume.affine, "L1")
 
 
@@ -68,11 +69,12 @@ def test_solid_and_dense_volumes_are_those_of_the_phantom_and_what_their_levels_
 
 @pytest.mark.seconds
 def test_canal_of_the_phantom_covers_its_true_canal_and_hardly_any_bone(spine, inside_at_400, device):
+    _, labels = spine
     inside, _, true_canal = inside_at_400
     canal = inside.canal.to_numpy()
     slices = canal.any(axis=(1, 2))
     assert np.count_nonzero(canal & true_canal) >= 0.98 * np.count_nonzero(true_canal[slices])  # measured 0.992
-    bone = clrecon.Mask.from_labels(inside.volume, spine[1], ["L1"], device=device).to_numpy()
+    bone = clrecon.Mask.from_labels(inside.volume, labels, ["L1"], device=device).to_numpy()
     assert np.count_nonzero(canal & bone) < 0.01 * np.count_nonzero(canal)  # measured 3e-4
     assert inside.canal_found.height_mm == pytest.approx(13.0, abs=3.0)  # its pedicles are 14 mm high
 
@@ -125,9 +127,10 @@ def test_meshes_of_dense_and_trabecular_bone_share_the_vertices_of_their_border(
 
 
 def test_label_map_of_a_vertebra_has_its_parts(spine, inside_20, device):
+    volume, _ = spine
     found = inside_20.to_label_map()
     assert found.names == {1: "dense", 2: "trabecular", 3: "canal"}
-    whole = clrecon.Mask.from_labels(spine[0], found, ["dense"], device=device)  # the same voxels of the whole scan
+    whole = clrecon.Mask.from_labels(volume, found, ["dense"], device=device)  # the same voxels of the whole scan
     assert whole.count == inside_20.dense.count
 
 
@@ -147,19 +150,19 @@ def test_pickling_a_vertebra_is_refused_with_what_can_be_pickled(inside_20):
         pickle.dumps(inside_20)
 
 
-def plate_in_a_label(thickness, spacing=(0.5, 0.5, 0.5), hu=900):
-    """A plate across k, `thickness` voxels thick, in a filled label around it."""
+def plate_in_a_label(thickness):
+    """A plate of 900 HU across k, `thickness` voxels of 0.5 mm thick, in a filled label around it."""
     voxels = np.full((24, 40, 40), 100, np.int16)
-    voxels[6 : 6 + thickness, 8:32, 8:32] = hu
+    voxels[6 : 6 + thickness, 8:32, 8:32] = 900
     labels = np.zeros(voxels.shape, np.uint8)
     labels[4:20, 6:34, 6:34] = 1
-    affine = np.diag([*spacing, 1.0])
-    return Volume(voxels, affine), LabelMap(labels, affine, {1: "plate"})
+    affine = np.diag([0.5, 0.5, 0.5, 1.0])
+    return Volume(voxels, affine), LabelMap(labels, affine, names={1: "plate"})
 
 
 def thickness_of_plate(voxels, device):
     """Of a plate of so many voxels of 0.5 mm."""
-    volume, _ = plate_in_a_label(voxels)
+    volume, _ = plate_in_a_label(thickness=voxels)
     return measure_thickness(clrecon.Mask.from_band(volume, (450, np.inf), device=device))
 
 
@@ -180,7 +183,7 @@ def test_thickness_of_more_than_two_voxels_is_measured(voxels, device):
 @pytest.fixture(scope="module")
 def plate_inside(device):
     """A label without an arch: a plate of 4 voxels in it."""
-    volume, labels = plate_in_a_label(4)
+    volume, labels = plate_in_a_label(thickness=4)
     return clrecon.vertebra_inside(volume, labels, "plate", device=device)
 
 
@@ -200,7 +203,7 @@ def test_a_label_without_a_closed_arch_has_its_other_parts(plate_inside):
 @pytest.fixture(scope="module")
 def plate_in_uneven_slices(device):
     """The plate of 4 slices and 24 x 24 voxels of 0.5 mm, in slices 0.4 and 0.6 mm apart in turn."""
-    volume, labels = plate_in_a_label(4)
+    volume, labels = plate_in_a_label(thickness=4)
     heights = np.cumsum(np.where(np.arange(24) % 2, 0.4, 0.6))
     uneven = Volume(
         volume.voxels, volume.affine, slice_positions=np.stack([np.zeros(24), np.zeros(24), heights], axis=1)
@@ -219,10 +222,10 @@ def test_meshes_of_a_vertebra_in_uneven_slices_are_refused(plate_in_uneven_slice
 
 def short_label():
     """The plate begins at slice 6, its label at slice 7."""
-    volume, labels = plate_in_a_label(4)
+    volume, labels = plate_in_a_label(thickness=4)
     short = np.zeros_like(labels.voxels)
     short[7:19, 6:34, 6:34] = 1
-    return volume, LabelMap(short, labels.affine, {1: "plate"})
+    return volume, LabelMap(short, labels.affine, names={1: "plate"})
 
 
 def test_a_label_that_ends_before_its_bone_is_warned_of(device):
@@ -233,14 +236,14 @@ def test_a_label_that_ends_before_its_bone_is_warned_of(device):
 
 def test_a_label_that_ends_before_its_bone_is_grown_to_it_by_a_level_without_a_warning(device):
     volume, labels = short_label()
-    grown = clrecon.vertebra_inside(volume, labels, 1, 300, device=device)
+    grown = clrecon.vertebra_inside(volume, labels, 1, iso_value=300, device=device)
     assert grown.dense.count == 4 * 24 * 24
     assert not any("outside of the label" in warning for warning in grown.warnings)
 
 
 def test_a_label_that_the_scan_cuts_ends_there_with_a_warning(device):
     """Slices 4 to 19 of a label of 28 x 28 voxels, in a scan of 12 slices."""
-    volume, labels = plate_in_a_label(4)
+    volume, labels = plate_in_a_label(thickness=4)
     cut = Volume(volume.voxels[:12], volume.affine)
     inside = clrecon.vertebra_inside(cut, labels, 1, device=device)
     assert inside.solid.count == 8 * 28 * 28
@@ -258,14 +261,14 @@ def test_bands_are_named_by_their_ends(band, name):
 
 @pytest.mark.parametrize("dense", [(900, 450), (None, None), (450,), "x", (np.nan, 900), 450])
 def test_a_band_of_dense_bone_that_is_no_two_ascending_numbers_is_refused(dense, device):
-    volume, labels = plate_in_a_label(4)
+    volume, labels = plate_in_a_label(thickness=4)
     with refused(UsageError, "dense", "bone"):
         clrecon.vertebra_inside(volume, labels, 1, dense=dense, device=device)
 
 
 @pytest.mark.parametrize("dense", [(2000, None), (1e6, 2e6)])
 def test_a_band_without_bone_is_refused(dense, device):
-    volume, labels = plate_in_a_label(4)
+    volume, labels = plate_in_a_label(thickness=4)
     with refused(NoSurfaceError, 1, 100, 900):
         clrecon.vertebra_inside(volume, labels, 1, dense=dense, device=device)
 
@@ -311,7 +314,7 @@ def test_solid_and_canal_in_tilted_and_oblique_scans_are_those_in_straight_ones(
     settings = PhantomSettings(levels="L1", size=(130, 130), spacing=(1.0, 1.0, 1.2), **turned)
     voxels, affine, _ = make_phantom(settings)
     truth = clrecon.phantom_truth(settings)
-    labels = LabelMap(truth.label_map(), affine, truth.names)
+    labels = LabelMap(truth.label_map(), affine, names=truth.names)
     inside = clrecon.vertebra_inside(Volume(voxels, affine), labels, "L1", device=device)
     # Measured in straight slices.
     assert inside.volumes_ml["solid"] == pytest.approx(35.76, rel=0.01)

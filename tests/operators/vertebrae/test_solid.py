@@ -22,20 +22,20 @@ SPINE = PhantomSettings(levels="L1-L2", size=(160, 160), spacing=(0.9, 0.9, 1.0)
 
 @pytest.fixture(scope="module")
 def spine():
-    """Volume, exact label map, and ml of a voxel."""
+    """A phantom of L1 and L2, and the labels of its truth."""
     voxels, affine, _ = make_phantom(SPINE)
     truth = clrecon.phantom_truth(SPINE)
-    return Volume(voxels, affine), LabelMap(truth.label_map(), affine, truth.names), 0.81e-3
+    return Volume(voxels, affine), LabelMap(truth.label_map(), affine, names=truth.names)
 
 
-def ring_in_slices(hu=1000, shape=(12, 30, 30)):
-    """A ring from 5 to 11 voxels in axial slices, all but the first and last: its HU, and its voxels."""
-    nk, nj, ni = shape
+def ring_in_slices():
+    """A ring of 1000 HU from 5 to 11 voxels in 12 axial slices, all but the first and last, and its voxels."""
+    nk, nj, ni = 12, 30, 30
     j, i = np.mgrid[:nj, :ni] - (nj - 1) / 2.0
     radius = np.hypot(j, i)
     ring = np.repeat(((radius >= 5) & (radius <= 11))[None], nk, axis=0)
     ring[[0, -1]] = False
-    return np.where(ring, hu, 0).astype(np.int16), ring
+    return np.where(ring, 1000, 0).astype(np.int16), ring
 
 
 def test_solid_bone_of_a_label_has_its_pore_and_cavity_filled_and_its_canal_open(device):
@@ -43,7 +43,7 @@ def test_solid_bone_of_a_label_has_its_pore_and_cavity_filled_and_its_canal_open
     holed = ring.copy()
     holed[5, 15, 21:24] = False  # a pore within the wall
     holed[4:8, 6:8, 14:17] = False  # a cavity that no ball of 1.5 mm closes
-    labels = LabelMap(holed, np.eye(4), {1: "ring"})
+    labels = LabelMap(holed, np.eye(4), names={1: "ring"})
 
     solid = vertebra_solid(Volume(voxels, np.eye(4)), labels, "ring", device=device)
 
@@ -73,7 +73,7 @@ def test_solid_bone_of_a_phantom_is_its_truth_and_the_share_that_the_level_adds(
     spine, device, level, share_added, dice
 ):
     """Half of 850 HU of the cortex and 50 HU around is 450 HU: lower levels lie farther out."""
-    volume, labels, _ = spine
+    volume, labels = spine
     of = {"surface": level, "iso_value": 200} if level == "cortex" else {"iso_value": level}
     solid = vertebra_solid(volume, labels, "L1", **of, device=device)
     truth = clrecon.Mask.from_labels(solid.scan, labels, ["L1"], device=device)
@@ -87,8 +87,8 @@ def test_solid_bone_of_a_phantom_is_its_truth_and_the_share_that_the_level_adds(
 @pytest.mark.seconds
 @pytest.mark.parametrize("level", [None, 226])
 def test_solid_bone_of_a_phantom_has_no_voxel_of_the_next_vertebra(spine, device, level):
-    volume, labels, _ = spine
-    solid = vertebra_solid(volume, labels, "L1", level, device=device)
+    volume, labels = spine
+    solid = vertebra_solid(volume, labels, "L1", iso_value=level, device=device)
     next_vertebra = clrecon.Mask.from_labels(solid.scan, labels, ["L2"], device=device)
     assert next_vertebra.count > 0
     assert not (solid & next_vertebra).count
@@ -97,16 +97,18 @@ def test_solid_bone_of_a_phantom_has_no_voxel_of_the_next_vertebra(spine, device
 @pytest.fixture(scope="module")
 def ball_with_a_small_label():
     """A shell of bone of 13 mm, and a label that ends at 12.5 mm, before the bone does."""
-    volume = hollow_ball(thickness=3.0)
+    volume = hollow_ball(radius=13.0, thickness=3.0)
     k, j, i = np.indices(volume.voxels.shape)
     far = np.sqrt((i - MIDDLE[0]) ** 2 + (j - MIDDLE[1]) ** 2 + (k - MIDDLE[2]) ** 2)
-    return volume, LabelMap((far < 12.5).astype(np.uint8), volume.affine, {1: "ball"})
+    return volume, LabelMap((far < 12.5).astype(np.uint8), volume.affine, names={1: "ball"})
 
 
 def test_solid_bone_of_the_cortex_has_the_volume_of_the_bone_and_that_of_a_level_more(ball_with_a_small_label, device):
     volume, labels = ball_with_a_small_label
     true_mm3 = 4.0 / 3.0 * np.pi * 13.0**3  # as many voxels of 1 mm
-    level, cortex = (vertebra_solid(volume, labels, 1, 200, surface=kind, device=device) for kind in ("hu", "cortex"))
+    level, cortex = (
+        vertebra_solid(volume, labels, 1, iso_value=200, surface=kind, device=device) for kind in ("hu", "cortex")
+    )
     assert level.count > 1.09 * true_mm3  # measured 1.17
     assert cortex.count == pytest.approx(true_mm3, rel=0.015)  # measured 0.991
 
@@ -118,14 +120,14 @@ def test_solid_bone_of_the_cortex_without_a_level_is_refused(ball_with_a_small_l
 
 
 def test_solid_bone_in_sagittal_slices_with_a_flipped_map_has_the_same_places(spine, device):
-    volume, labels, _ = spine
-    plain = vertebra_solid(volume, labels, "L1", 300, device=device)
+    volume, labels = spine
+    plain = vertebra_solid(volume, labels, "L1", iso_value=300, device=device)
     sagittal = Volume(volume.voxels.transpose(2, 0, 1), volume.affine[:, [1, 2, 0, 3]])
     flipped = labels.affine @ np.diag([-1.0, 1.0, 1.0, 1.0])
     flipped[:3, 3] += labels.affine[:3, 0] * (labels.shape_ijk[0] - 1)
-    flipped_map = LabelMap(labels.voxels[:, :, ::-1], flipped, labels.names)
+    flipped_map = LabelMap(labels.voxels[:, :, ::-1], flipped, names=labels.names)
 
-    found = vertebra_solid(sagittal, flipped_map, 20, 300, device=device)
+    found = vertebra_solid(sagittal, flipped_map, 20, iso_value=300, device=device)
 
     assert found.count == plain.count
     places = plain.scan.ijk_to_lps(np.argwhere(plain.to_numpy())[:, ::-1])
@@ -134,9 +136,9 @@ def test_solid_bone_in_sagittal_slices_with_a_flipped_map_has_the_same_places(sp
 
 
 def test_solid_bone_of_sagittal_slices_is_given_in_axial_ones(spine, device):
-    volume, labels, _ = spine
+    volume, labels = spine
     sagittal = Volume(volume.voxels.transpose(2, 0, 1), volume.affine[:, [1, 2, 0, 3]])
-    normal = np.cross(*vertebra_solid(sagittal, labels, 20, 300, device=device).scan.affine[:3, :2].T)
+    normal = np.cross(*vertebra_solid(sagittal, labels, 20, iso_value=300, device=device).scan.affine[:3, :2].T)
     assert abs(normal[2]) > 0.99 * np.linalg.norm(normal)  # along the axis of the body
 
 
@@ -145,7 +147,7 @@ def test_solid_bone_of_an_uneven_stack_has_the_voxels_and_places_of_its_label(de
     heights = np.cumsum([0, *[1.0, 1.5] * 5, 1.0])
     positions = np.stack([np.zeros(12), np.zeros(12), heights], axis=1)
     volume = Volume(voxels, np.eye(4), slice_positions=positions)
-    labels = LabelMap(np.repeat(ring, 2, axis=0), np.diag([1.0, 1.0, 0.7, 1.0]), {1: "ring"})
+    labels = LabelMap(np.repeat(ring, 2, axis=0), np.diag([1.0, 1.0, 0.7, 1.0]), names={1: "ring"})
 
     solid = vertebra_solid(volume, labels, 1, device=device)
 
@@ -158,7 +160,7 @@ def test_solid_bone_of_an_uneven_stack_has_the_voxels_and_places_of_its_label(de
 
 
 VOXELS, RING = ring_in_slices()
-RING_VOLUME, RING_LABELS = Volume(VOXELS, np.eye(4)), LabelMap(RING, np.eye(4), {1: "ring"})
+RING_VOLUME, RING_LABELS = Volume(VOXELS, np.eye(4)), LabelMap(RING, np.eye(4), names={1: "ring"})
 
 
 @pytest.mark.parametrize(
@@ -180,18 +182,18 @@ def test_solid_bone_of_wrong_arguments_is_refused(device, volume, labels, label,
 def test_solid_bone_above_all_hu_of_its_label_is_refused(device):
     dense_around = Volume(np.where(RING, VOXELS, 3000), np.eye(4))
     with refused(NoSurfaceError, 1, 2000, 1000):  # the label, the level, and its highest HU
-        vertebra_solid(dense_around, RING_LABELS, 1, 2000, device=device)
+        vertebra_solid(dense_around, RING_LABELS, 1, iso_value=2000, device=device)
 
 
 def test_solid_bone_below_all_hu_is_refused(device):
     with refused(NoSurfaceError, 1, -2000, 0):
-        vertebra_solid(RING_VOLUME, RING_LABELS, 1, -2000, device=device)
+        vertebra_solid(RING_VOLUME, RING_LABELS, 1, iso_value=-2000, device=device)
 
 
 def test_solid_bone_of_a_label_beyond_the_scan_is_refused(device):
     numbers = np.concatenate([RING.astype(np.uint8), 2 * RING.astype(np.uint8)])
     with refused(RefusedInputError, "CT", 2):
-        vertebra_solid(RING_VOLUME, LabelMap(numbers, np.eye(4), {1: "ring", 2: "away"}), "away", device=device)
+        vertebra_solid(RING_VOLUME, LabelMap(numbers, np.eye(4), names={1: "ring", 2: "away"}), "away", device=device)
 
 
 def test_solid_bone_of_a_map_beside_the_scan_is_refused(device):
