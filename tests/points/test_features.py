@@ -52,11 +52,12 @@ def test_in_a_cell_of_equal_points_the_ratio_is_infinite_but_for_a_mean_of_zero(
 @pytest.mark.parametrize("shape", [plane, sphere, cube])
 def test_the_median_ratio_is_about_the_same_on_a_plane_a_sphere_and_a_cube(shape, cloud):
     """Sixteen random neighbours in a plane lie 2.7 times as far as the nearest on average; with noise some more."""
-    assert 2.4 < np.median(measure_ratios(getattr(shape(), cloud))) < 3.1
+    assert 2.4 < np.median(measure_ratios(getattr(shape(), cloud))) < 3.1  # measured 2.49 to 3.01
 
 
 @pytest.fixture(scope="module")
 def noisy_cube():
+    """Points on a cube of 30 mm with noise, and `clean` without; which lie near its edges and which on its faces."""
     return cube()
 
 
@@ -67,12 +68,13 @@ def measure_variation(points: np.ndarray) -> np.ndarray:
 
 
 def test_the_distance_ratio_does_not_tell_edges_of_a_cube_from_its_faces(noisy_cube):
-    """0.5 is blind."""
-    assert 0.35 < area_under_curve(measure_ratios(noisy_cube.points), noisy_cube.regions["edges"]) < 0.5
+    area = area_under_curve(measure_ratios(noisy_cube.points), noisy_cube.regions["edges"])
+    assert area == pytest.approx(0.5, abs=0.1)  # 0.5 is blind; measured 0.443
 
 
 @pytest.mark.parametrize(("cloud", "least"), [("points", 0.88), ("clean", 0.98)], ids=["noisy", "clean"])
 def test_the_surface_variation_tells_edges_of_a_cube_from_its_faces(noisy_cube, cloud, least):
+    """Measured 0.912 with noise and 0.991 without; 0.5 is blind, 1 tells all."""
     variation = measure_variation(getattr(noisy_cube, cloud))
     assert area_under_curve(variation, noisy_cube.regions["edges"]) > least
 

@@ -14,20 +14,26 @@ from clrecon.points import PointCloud
 from clrecon.points.keep import keep_clusters, measure_clusters, parse_keep_rules
 
 
-def block(n: int, corner: tuple[float, float, float]) -> np.ndarray:
+def block(n: int, *, corner: tuple[float, float, float]) -> np.ndarray:
     """n points in a block of 10 x 10 points a layer."""
     index = np.arange(n)
     return np.stack([index % 10, index // 10 % 10, index // 100], axis=1) + corner
 
 
-def sheet(nx: int, ny: int, corner: tuple[float, float, float], thickness: float = 0.0) -> np.ndarray:
+def sheet(nx: int, ny: int, *, corner: tuple[float, float, float], thickness: float = 0.0) -> np.ndarray:
+    """nx x ny points 1 mm apart, every other one higher by the thickness."""
     x, y = np.meshgrid(np.arange(nx), np.arange(ny))
     z = thickness * ((x + y) % 2)
     return np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1) + corner
 
 
 SMALL_BLOCK, SHEET, LARGE_BLOCK, OTHER_BLOCK = range(4)
-PARTS = (block(300, (0, 0, 0)), sheet(40, 30, (100, 0, 0)), block(700, (0, 100, 0)), block(300, (0, 0, 100)))
+PARTS = (
+    block(300, corner=(0, 0, 0)),
+    sheet(40, 30, corner=(100, 0, 0)),
+    block(700, corner=(0, 100, 0)),
+    block(300, corner=(0, 0, 100)),
+)
 LABELS = np.concatenate([np.full(len(part), number) for number, part in enumerate(PARTS)])
 
 
@@ -98,10 +104,10 @@ def clusters_of(*parts: np.ndarray) -> PointCloud:
 @pytest.mark.parametrize(
     ("points", "is_sheet"),
     [
-        (sheet(40, 30, (0, 0, 0), thickness=1.0), True),
-        (sheet(40, 30, (0, 0, 0), thickness=2.0), False),
-        (sheet(24, 20, (0, 0, 0)), False),
-        (block(600, (0, 0, 0)), False),
+        (sheet(40, 30, corner=(0, 0, 0), thickness=1.0), True),
+        (sheet(40, 30, corner=(0, 0, 0), thickness=2.0), False),
+        (sheet(24, 20, corner=(0, 0, 0)), False),
+        (block(600, corner=(0, 0, 0)), False),
     ],
     ids=["17 times as wide as thick", "9 times as wide as thick", "480 points", "block"],
 )
@@ -111,7 +117,7 @@ def test_a_sheet_is_many_times_as_wide_as_thick_and_has_500_points(points: np.nd
 
 def test_deviations_of_a_sheet_are_half_its_thickness_and_those_of_rows_of_numbers() -> None:
     """Of n numbers in a row it is sqrt((n^2 - 1) / 12)."""
-    (deviations,) = measure_clusters(clusters_of(sheet(40, 30, (0, 0, 0), thickness=1.0))).deviations
+    (deviations,) = measure_clusters(clusters_of(sheet(40, 30, corner=(0, 0, 0), thickness=1.0))).deviations
     expected = [0.5, np.sqrt((30**2 - 1) / 12), np.sqrt((40**2 - 1) / 12)]
     assert deviations == pytest.approx(expected, rel=1e-4)  # checks of the thickness tilt the axes by a hair
 

@@ -11,12 +11,17 @@ import clrecon
 from clrecon.errors import UsageError
 
 
-def make_cloud(count=7):
+def make_cloud():
+    """Seven points with normals, HU and labels."""
+    count = 7
     rng = np.random.default_rng(5)
     normals = rng.normal(size=(count, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     return clrecon.PointCloud(
-        rng.uniform(-50, 50, (count, 3)), normals, rng.integers(-900, 900, count), np.arange(count) - 1
+        rng.uniform(-50, 50, (count, 3)),
+        normals=normals,
+        hu=rng.integers(-900, 900, count),
+        labels=np.arange(count) - 1,
     )
 
 
@@ -104,11 +109,11 @@ def thousand_points():
 
 
 def test_repr_of_a_clustering_has_its_cloud_and_the_points_before(device, thousand_points):
-    clusters = clrecon.cluster_points(thousand_points, 1.0, 3, device=device)
+    clusters = clrecon.cluster_points(thousand_points, eps=1.0, min_samples=3, device=device)
     assert repr(clusters) == "Clustering(PointCloud(1000 points, with labels, LPS mm) of 1,000)"
 
 
 def test_repr_of_a_step_has_its_cloud_the_points_before_and_those_removed_by_reason(device, thousand_points):
-    thinned = clrecon.thin_points(thousand_points, 2.0, device=device)
+    thinned = clrecon.thin_points(thousand_points, spacing=2.0, device=device)
     removed = 1000 - len(thinned.cloud)
     assert repr(thinned) == f"PointStep({thinned.cloud!r} of 1,000, {removed} as {thinned.reasons[0]})"

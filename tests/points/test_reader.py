@@ -209,7 +209,7 @@ def bare_file(tmp_path):
 @pytest.fixture
 def ras_file(tmp_path):
     """A file that names RAS as its frame."""
-    PointCloud(POINTS).save(tmp_path / "ras.ply", "ras")
+    PointCloud(POINTS).save(tmp_path / "ras.ply", space="ras")
     return tmp_path / "ras.ply"
 
 
@@ -323,7 +323,9 @@ def test_an_archive_without_points_of_three_columns_is_refused(tmp_path, arrays,
 @pytest.mark.parametrize("extension", ["ply", "vtp", "npz", "xyz", "las"])
 def test_files_with_changed_lost_and_added_bytes_give_finite_points_or_one_clear_line(extension, tmp_path):
     """Some changes are not noticed, or do no harm; more than a quarter are refused."""
-    cloud = PointCloud(np.tile(POINTS, (10, 1)), np.tile([0, 0, 1.0], (30, 1)), np.tile(HU, 10), np.arange(30))
+    cloud = PointCloud(
+        np.tile(POINTS, (10, 1)), normals=np.tile([0, 0, 1.0], (30, 1)), hu=np.tile(HU, 10), labels=np.arange(30)
+    )
     path = tmp_path / f"a.{extension}"
     cloud.save(path)
     whole, chance, refused, files = path.read_bytes(), random.Random(7), 0, 200

@@ -16,7 +16,7 @@ WITH_THE_NEXT, WITH_THE_NEXT_BUT_ONE = [6, 5, 10, 9, 0], [4, 11, 5, 0, 0]
 def five_slices() -> GhostSlices:
     """The middle one is the least like its neighbours, which are more like each other."""
     counts = np.array([VOXELS_OF_SLICES, WITH_THE_NEXT, WITH_THE_NEXT_BUT_ONE])
-    return judge_slices(counts, 100, (200.0, np.inf), ("a word",))
+    return judge_slices(counts, area=100, hu=(200.0, np.inf), warnings=("a word",))
 
 
 def test_likeness_of_a_slice_is_the_larger_dice_coefficient_with_its_two_neighbours(five_slices: GhostSlices) -> None:
@@ -65,16 +65,16 @@ def test_the_report_of_ghost_slices_has_the_figures_of_each_and_the_limits(five_
     }
 
 
-def judge_three_slices(voxels: int, common: tuple[int, int], around: int, columns: int) -> GhostSlices:
+def judge_three_slices(*, voxels: int, common: tuple[int, int], around: int, columns: int) -> GhostSlices:
     """Three slices of so many voxels each: those in common with either neighbour, and of both neighbours."""
-    return judge_slices(np.array([[voxels] * 3, [*common, 0], [around, 0, 0]]), columns, (0.0, 1.0))
+    return judge_slices(np.array([[voxels] * 3, [*common, 0], [around, 0, 0]]), area=columns, hu=(0.0, 1.0))
 
 
 @pytest.mark.parametrize("common", [(0, 9), (9, 0)], ids=["with the next", "with the one before"])
 def test_a_slice_more_like_one_of_its_neighbours_than_these_are_like_each_other_is_no_ghost(
     common: tuple[int, int],
 ) -> None:
-    judged = judge_three_slices(10, common, around=8, columns=100)
+    judged = judge_three_slices(voxels=10, common=common, around=8, columns=100)
     assert judged.nearest[1] == pytest.approx(0.9)
     assert judged.around[1] == pytest.approx(0.8)
     assert judged.slices == ()
@@ -85,7 +85,7 @@ def test_a_ghost_is_less_than_three_quarters_as_like_its_neighbours_as_these_are
     common: int, ghosts: tuple[int, ...]
 ) -> None:
     """The neighbours are equal, with 8 voxels each."""
-    assert judge_three_slices(8, (common, 0), around=8, columns=9).slices == ghosts
+    assert judge_three_slices(voxels=8, common=(common, 0), around=8, columns=9).slices == ghosts
 
 
 @pytest.mark.parametrize(
@@ -95,4 +95,4 @@ def test_less_than_42_percent_beyond_chance_of_a_ghost_lie_within_a_neighbour(
     common: tuple[int, int], ghosts: tuple[int, ...]
 ) -> None:
     """0.70 and 0.72 of its voxels, where chance is 0.5: 0.40 and 0.44, as a clean phantom of 5 mm has."""
-    assert judge_three_slices(100, common, around=100, columns=200).slices == ghosts
+    assert judge_three_slices(voxels=100, common=common, around=100, columns=200).slices == ghosts

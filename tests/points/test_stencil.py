@@ -50,7 +50,7 @@ VOLUMES = {
 @pytest.mark.parametrize("eps_mm", [0.3, 0.644531, 0.8, 1.2, 2.0, 3.7, 50.0])
 @pytest.mark.parametrize("volume", VOLUMES.values(), ids=VOLUMES)
 def test_members_of_a_stencil_are_the_voxels_within_eps(volume: Volume, eps_mm: float) -> None:
-    stencil = make_stencil(Lattice.of(volume), eps_mm)
+    stencil = make_stencil(Lattice.of(volume), eps=eps_mm)
     slices = range(volume.shape_ijk[2])
     assert stencil.tables.shape == (len(slices), 2)
     for k in slices:
@@ -60,7 +60,7 @@ def test_members_of_a_stencil_are_the_voxels_within_eps(volume: Volume, eps_mm: 
 
 def test_two_voxels_are_members_of_each_other_or_neither_is() -> None:
     volume = uneven()
-    stencil = make_stencil(Lattice.of(volume), 1.9)
+    stencil = make_stencil(Lattice.of(volume), eps=1.9)
     pairs = {(k, di, dj, dk) for k in range(volume.shape_ijk[2]) for di, dj, dk in offsets_of(stencil, k)}
     assert any(dk for _, _, _, dk in pairs), "some lie in other slices"
     assert {(k + dk, -di, -dj, -dk) for k, di, dj, dk in pairs} == pairs
@@ -74,7 +74,7 @@ def test_two_voxels_are_members_of_each_other_or_neither_is() -> None:
 def test_stencils_of_known_scans_have_as_many_members_as_counted(
     spacing: tuple[float, ...], eps_mm: float, members: int
 ) -> None:
-    stencil = make_stencil(Lattice((512, 512, 99), np.diag((*spacing, 1.0))), eps_mm)
+    stencil = make_stencil(Lattice((512, 512, 99), np.diag((*spacing, 1.0))), eps=eps_mm)
     offsets = np.indices([2 * int(eps_mm / step) + 1 for step in spacing]).reshape(3, -1).T
     offsets -= [int(eps_mm / step) for step in spacing]
     assert np.count_nonzero(np.linalg.norm(offsets * spacing, axis=1) <= eps_mm) == members
@@ -83,7 +83,7 @@ def test_stencils_of_known_scans_have_as_many_members_as_counted(
 
 def test_members_in_the_plane_of_a_stencil_are_counted() -> None:
     """Steps of 0.645 mm: with the diagonal ones, 0.91 mm away, nine lie within 1.2 mm."""
-    assert make_stencil(Lattice((512, 512, 95), THORACIC), 1.2).in_plane == 9
+    assert make_stencil(Lattice((512, 512, 95), THORACIC), eps=1.2).in_plane == 9
 
 
 @pytest.mark.parametrize(
@@ -91,7 +91,7 @@ def test_members_in_the_plane_of_a_stencil_are_counted() -> None:
 )
 def test_an_eps_of_one_slice_gap_reaches_the_next_slices_despite_rounding(eps_mm: float, members: int) -> None:
     gap_mm = 0.1 + 0.2  # not 0.3
-    stencil = make_stencil(Lattice((5, 5, 5), np.diag((1.0, 1.0, gap_mm, 1.0))), eps_mm)
+    stencil = make_stencil(Lattice((5, 5, 5), np.diag((1.0, 1.0, gap_mm, 1.0))), eps=eps_mm)
     assert stencil.members == (members, members)
     assert stencil.is_alone == (members == 1)
 
@@ -99,7 +99,7 @@ def test_an_eps_of_one_slice_gap_reaches_the_next_slices_despite_rounding(eps_mm
 @pytest.mark.parametrize(("eps_mm", "holds"), [(np.sqrt(3**2 + 4**2 + 5**2), True), (7.0, False)])
 def test_a_volume_lies_within_eps_where_its_diagonal_does(eps_mm: float, holds: bool) -> None:
     box = Lattice((4, 5, 6), np.eye(4))
-    assert make_stencil(box, eps_mm).holds((4, 5, 6)) == holds
+    assert make_stencil(box, eps=eps_mm).holds((4, 5, 6)) == holds
 
 
 @pytest.mark.parametrize(("shorter_mm", "holds"), [(0.0, True), (0.001, False)])
@@ -107,19 +107,19 @@ def test_an_uneven_volume_lies_within_eps_where_its_longest_distance_does(shorte
     volume = uneven()
     corners = volume.ijk_to_lps([(i, j, k) for i in (0, 3) for j in (0, 4) for k in range(6)])
     longest_mm = np.linalg.norm(corners[:, None] - corners, axis=2).max()
-    assert make_stencil(Lattice.of(volume), longest_mm - shorter_mm).holds(volume.shape_ijk) == holds
+    assert make_stencil(Lattice.of(volume), eps=longest_mm - shorter_mm).holds(volume.shape_ijk) == holds
 
 
 def test_slices_with_the_same_neighbours_share_a_table() -> None:
     """Slices at 0, 1, 2, 3, 4 and 9 mm, of which 1, 2 and 3 have one above and one below within 1 mm."""
     positions = np.array([(0.0, 0.0, z) for z in (0, 1, 2, 3, 4, 9)])
-    tables = make_stencil(Lattice((3, 3, 6), np.eye(4), positions), 1.0).tables.tolist()
+    tables = make_stencil(Lattice((3, 3, 6), np.eye(4), positions), eps=1.0).tables.tolist()
     assert tables[1] == tables[2] == tables[3]
-    assert len({tuple(table) for table in tables}) == 4
+    assert len({tuple(table) for table in tables}) == 4  # of slices 0, 1 to 3, 4 and 5
 
 
 def test_rows_of_a_stencil_are_sorted_by_the_distance_of_their_middle() -> None:
-    dj, dk, low, high = make_stencil(Lattice((30, 30, 30), THORACIC), 3.0).rows.T
+    dj, dk, low, high = make_stencil(Lattice((30, 30, 30), THORACIC), eps=3.0).rows.T
     middles = np.stack([(low + high) / 2, dj, dk], axis=1) * np.diag(THORACIC)[:3]
     distances = np.linalg.norm(middles, axis=1)
     assert (np.diff(distances) > -tolerances.FLOAT64_PLACE_MM).all()
@@ -127,7 +127,7 @@ def test_rows_of_a_stencil_are_sorted_by_the_distance_of_their_middle() -> None:
 
 @pytest.mark.parametrize("lattice", [Lattice((30, 30, 30), SHEARED), Lattice.of(uneven())], ids=["sheared", "uneven"])
 def test_forward_rows_hold_the_members_after_a_voxel_in_the_order_of_the_array(lattice: Lattice) -> None:
-    stencil = make_stencil(lattice, 2.4)
+    stencil = make_stencil(lattice, eps=2.4)
     forward = stencil.forward()
     for k in range(lattice.shape_ijk[2]):
         after = {(di, dj, dk) for di, dj, dk in offsets_of(stencil, k) if (dk, dj, di) > (0, 0, 0)}
@@ -155,4 +155,4 @@ def test_the_gap_of_tilted_slices_is_their_distance_and_not_their_step() -> None
 @pytest.mark.parametrize("eps", [0.0, -1.0, float("nan"), float("inf"), "1", True, None])
 def test_an_eps_that_is_no_finite_length_above_0_is_refused(eps) -> None:
     with refused(UsageError, 0.0, "distance"):
-        make_stencil(Lattice((4, 4, 4), np.eye(4)), eps)
+        make_stencil(Lattice((4, 4, 4), np.eye(4)), eps=eps)

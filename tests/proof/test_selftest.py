@@ -201,7 +201,7 @@ def test_another_count_of_numbers_fails_a_check_of_equality() -> None:
 
 @pytest.mark.fault_row(57)
 def test_check_of_closeness_returns_the_largest_difference_within_the_tolerance() -> None:
-    assert require_close([1.0, np.nan], [1.25, np.nan], 0.5, "numbers") == 0.25
+    assert require_close([1.0, np.nan], [1.25, np.nan], allowed=0.5, subject="numbers") == 0.25
 
 
 @pytest.mark.fault_row(57)
@@ -212,24 +212,24 @@ def test_check_of_closeness_returns_the_largest_difference_within_the_tolerance(
 )
 def test_number_beyond_the_tolerance_fails_a_check_of_closeness(found: list[float]) -> None:
     with refused(DeviceError, 2, 0.5):  # of two numbers, tolerance 0.5
-        require_close(found, [1.0, np.nan], 0.5, "numbers")
+        require_close(found, [1.0, np.nan], allowed=0.5, subject="numbers")
 
 
 @pytest.mark.fault_row(57)
 def test_numbers_beyond_the_tolerance_pass_a_check_of_shares_up_to_the_allowed_share() -> None:
     one_of_100_apart = [0.0] * 99 + [9.0]
-    assert require_share(one_of_100_apart, [0.0] * 100, 1.0, 0.01, "numbers") == 0.0
+    assert require_share(one_of_100_apart, [0.0] * 100, allowed=1.0, share=0.01, subject="numbers") == 0.0
 
 
 @pytest.mark.fault_row(57)
 def test_numbers_beyond_the_tolerance_above_the_allowed_share_fail_with_count_and_largest_difference() -> None:
     two_of_100_apart = [0.0] * 98 + [9.0, 2.0]
     with refused(DeviceError, 2, 100, 9):
-        require_share(two_of_100_apart, [0.0] * 100, 1.0, 0.01, "numbers")
+        require_share(two_of_100_apart, [0.0] * 100, allowed=1.0, share=0.01, subject="numbers")
 
 
 def check_named(name: str) -> Check:
-    return Check(name, (), lambda device: "")
+    return Check(name, kernels=(), run=lambda device: "")
 
 
 SECONDS_OF_A_HANG = 60.0
@@ -262,7 +262,7 @@ def test_check_that_raises_an_error_fails_with_its_type_and_message(device: Devi
     def fail(device: Device) -> str:
         raise error
 
-    outcome = run_check(device, Check("a check", (), fail))
+    outcome = run_check(device, Check("a check", kernels=(), run=fail))
     assert outcome["passed"] is False
     assert outcome["detail"] == f"{type(error).__name__}: {error}"
 

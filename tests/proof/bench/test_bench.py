@@ -18,7 +18,8 @@ from clrecon.proof.phantom import PhantomSettings, make_phantom, write_phantom
 
 
 @pytest.fixture(scope="module")
-def ct(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def sphere_ct(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A DICOM series of a sphere of the phantom."""
     folder = tmp_path_factory.mktemp("bench") / "ct"
     write_phantom(folder, PhantomSettings(kind="sphere", size=(48, 40), slices=24, noise=0.0))
     return folder
@@ -31,10 +32,10 @@ VOXELS = 48 * 40 * 24
 class RunOfBench:
     """A bench of three runs on the series: its result, its written report and the stages that it reported."""
 
-    def __init__(self, ct: Path, device: Any, report_path: Path):
+    def __init__(self, sphere_ct: Path, device: Any, report_path: Path):
         self.stages: list[str] = []
         self.result: Any = bench.run_bench(
-            ct, iso_value=0.0, device=str(device.index), runs=3, report_path=report_path,
+            sphere_ct, iso_value=0.0, device=str(device.index), runs=3, report_path=report_path,
             progress=lambda stage, done, total: self.stages.append(stage),
         )  # fmt: skip
         self.report: Any = json.loads(report_path.read_text())
@@ -42,8 +43,8 @@ class RunOfBench:
 
 
 @pytest.fixture(scope="module")
-def run(device: Any, ct: Path, tmp_path_factory: pytest.TempPathFactory) -> RunOfBench:
-    return RunOfBench(ct, device, tmp_path_factory.mktemp("run") / "b.json")
+def run(device: Any, sphere_ct: Path, tmp_path_factory: pytest.TempPathFactory) -> RunOfBench:
+    return RunOfBench(sphere_ct, device, tmp_path_factory.mktemp("run") / "b.json")
 
 
 def test_bench_of_a_series_has_its_input_times_and_stages(run: RunOfBench) -> None:
@@ -109,13 +110,13 @@ def test_bench_without_an_input_makes_a_synthetic_spine_of_512_x_512_x_149_voxel
 
 
 def test_bench_without_vtk_has_times_and_a_warning_but_no_ratio(
-    device: Any, ct: Path, monkeypatch: pytest.MonkeyPatch
+    device: Any, sphere_ct: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(*_: Any) -> None:
         raise ImportError("no VTK")
 
     monkeypatch.setattr(bench, "FlyingEdges", refuse)
-    result = bench.run_bench(ct, device=str(device.index), runs=2)
+    result = bench.run_bench(sphere_ct, device=str(device.index), runs=2)
     (entry,) = result["devices"]
     assert (entry["peer"], entry["ratio"]) == (None, None)
     assert entry["warm_seconds"]["median"] > 0
@@ -123,28 +124,28 @@ def test_bench_without_vtk_has_times_and_a_warning_but_no_ratio(
 
 
 def test_bench_of_all_devices_goes_on_after_one_that_fails_with_a_warning(
-    device: Any, ct: Path, monkeypatch: pytest.MonkeyPatch
+    device: Any, sphere_ct: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("clrecon.opencl.list_devices", lambda: [BurntDevice(device), device])
-    result = bench.run_bench(ct, device="all", runs=1)
+    result = bench.run_bench(sphere_ct, device="all", runs=1)
     assert [entry["error"] for entry in result["devices"]] == ["it caught fire", None]
     assert f"{device.name} failed: it caught fire" in result["warnings"]
 
 
 def test_error_of_the_first_device_is_raised_where_all_devices_fail(
-    device: Any, ct: Path, monkeypatch: pytest.MonkeyPatch
+    device: Any, sphere_ct: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("clrecon.opencl.list_devices", lambda: [BurntDevice(device)])
     with refused(DeviceError, "fire"):
-        bench.run_bench(ct, device="all", runs=1)
+        bench.run_bench(sphere_ct, device="all", runs=1)
 
 
 def test_peer_with_another_number_of_triangles_is_warned_of(
-    device: Any, ct: Path, monkeypatch: pytest.MonkeyPatch
+    device: Any, sphere_ct: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     real = bench.FlyingEdges.run
     monkeypatch.setattr(bench.FlyingEdges, "run", lambda self, level: real(self, level)._replace(triangles=7))
-    result = bench.run_bench(ct, device=str(device.index), runs=1)
+    result = bench.run_bench(sphere_ct, device=str(device.index), runs=1)
     assert any("flying edges 7: the times are not of the same work" in text for text in result["warnings"])
 
 
@@ -174,7 +175,7 @@ def test_iso_values_of_a_resident_volume_go_outwards_and_none_comes_twice(monkey
 
     monkeypatch.setattr(isosurface, "SurfaceExtractor", FakeExtractor)
     nothing: Any = None
-    bench._time_resident(nothing, nothing, 0.0, 7)
+    bench._time_resident(nothing, nothing, hu=0.0, runs=7)
     assert FakeExtractor.asked == [0.0, 1.0, -1.0, 2.0, -2.0, -3.0]  # 3 and 4 are beyond the scan
 
 
@@ -183,7 +184,7 @@ def test_no_runs_on_a_resident_volume_have_no_times(monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr(isosurface, "SurfaceExtractor", FakeExtractor)
     nothing: Any = None
-    assert bench._time_resident(nothing, nothing, 0.0, 0) is None
+    assert bench._time_resident(nothing, nothing, hu=0.0, runs=0) is None
 
 
 def test_devices_named_all_are_those_without_simulators_and_unusable_ones(
@@ -235,7 +236,7 @@ def test_unknown_device_of_the_bench_is_refused_before_a_missing_input(tmp_path:
         bench.run_bench(tmp_path / "nowhere", device="abacus")
 
 
-def test_bench_without_a_surface_is_refused_and_writes_no_report(device: Any, ct: Path, tmp_path: Path) -> None:
+def test_bench_without_a_surface_is_refused_and_writes_no_report(device: Any, sphere_ct: Path, tmp_path: Path) -> None:
     with refused(NoSurfaceError, 5000):
-        bench.run_bench(ct, iso_value=5000.0, device=str(device.index), runs=1, report_path=tmp_path / "b.json")
+        bench.run_bench(sphere_ct, iso_value=5000.0, device=str(device.index), runs=1, report_path=tmp_path / "b.json")
     assert list(tmp_path.iterdir()) == []

@@ -40,21 +40,22 @@ def test_spread_of_one_number_is_that_number() -> None:
 
 def test_first_of_two_timed_functions_changes_with_every_pair_after_a_warm_up() -> None:
     time = FakeTime()
-    ours, theirs = alternate(time.worker("a", 1.0), time.worker("b", 2.0), 4, clock=time.clock)
+    ours, theirs = alternate(time.worker("a", 1.0), time.worker("b", 2.0), pairs=4, clock=time.clock)
     assert time.order == "ab" + "ab" + "ba" + "ab" + "ba"
     assert (ours, theirs) == ([1.0] * 4, [2.0] * 4)
 
 
 def test_without_a_warm_up_no_call_precedes_the_first_pair() -> None:
     time = FakeTime()
-    alternate(time.worker("a", 1.0), time.worker("b", 2.0), 1, warm=False, clock=time.clock)
+    alternate(time.worker("a", 1.0), time.worker("b", 2.0), pairs=1, warm=False, clock=time.clock)
     assert time.order == "ab"
 
 
 @pytest.mark.parametrize(("limit", "pairs"), [(100.0, 9), (16.0, 5), (0.0, FEWEST_PAIRS), (None, 9)])
 def test_time_limit_ends_the_pairs_but_not_before_the_fewest(limit: float | None, pairs: int) -> None:
+    """A pair takes 3 s; nine are asked for, and the limit is looked at before each."""
     time = FakeTime()
-    ours, theirs = alternate(time.worker("a", 1.0), time.worker("b", 2.0), 9, limit_s=limit, clock=time.clock)
+    ours, theirs = alternate(time.worker("a", 1.0), time.worker("b", 2.0), pairs=9, limit_s=limit, clock=time.clock)
     assert len(ours) == len(theirs) == pairs
 
 

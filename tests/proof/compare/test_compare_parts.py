@@ -48,7 +48,11 @@ pytestmark = pytest.mark.first_device
 OBLIQUE = np.array([[0.8, 0.1, 0.2, -20.0], [-0.1, 0.7, 0.0, 30.0], [0.05, 0.0, -1.2, 100.0], [0, 0, 0, 1.0]])
 
 
-def make_ball(affine: Any = OBLIQUE, radius: float = 9.3) -> Volume:
+RADIUS = 9.3  # voxels
+
+
+def make_ball(affine: Any = OBLIQUE, radius: float = RADIUS) -> Volume:
+    """A ball around i, j, k = 15.7, 15.1, 14.2 in 32 x 30 x 28 voxels: 200 HU at its radius, 100 more a voxel in."""
     k, j, i = np.indices((28, 30, 32))
     away = np.sqrt((k - 14.2) ** 2 + (j - 15.1) ** 2 + (i - 15.7) ** 2)
     return Volume(np.clip(np.rint(100.0 * (radius - away) + 200.0), -1000, 900).astype(np.int16), affine)
@@ -60,24 +64,25 @@ def surface_of(volume: Volume, device: Any = None) -> Mesh:
 
 def test_cut_of_a_ball_is_one_closed_circle(device: Any) -> None:
     volume = make_ball()
-    plane = Plane("", 2, 14.2 + 4.0, 0, 1, False)
+    plane = Plane("", axis=2, at=14.2 + 4.0, across=0, down=1, flip=False)
     lines = cut_mesh(surface_of(volume, device), volume, plane)
     radius = np.hypot(*(lines.reshape(-1, 2) - [15.7, 15.1]).T)
-    np.testing.assert_allclose(radius, np.sqrt(9.3**2 - 4.0**2), atol=0.05)
+    np.testing.assert_allclose(radius, np.sqrt(RADIUS**2 - 4.0**2), atol=0.05)  # voxels
     ends, many = np.unique(np.round(lines.reshape(-1, 2), 3), axis=0, return_counts=True)
-    assert (many == 2).all() and len(ends) == len(lines) > 50  # one closed line
+    assert (many == 2).all()  # one closed line
+    assert len(ends) == len(lines) > 50
 
 
 def test_planes_of_a_comparison_go_through_the_middle_of_the_object() -> None:
     volume = make_ball(np.diag([1.0, 1.0, 1.0, 1.0]))
     planes, box = find_planes(volume, 200)
-    np.testing.assert_array_equal(box, [[7, 6, 5], [25, 24, 23]])  # corners about the ball, i, j, k
+    np.testing.assert_array_equal(box, [[7, 6, 5], [25, 24, 23]])  # i, j, k: 15.7 - 9.3 is 6.4, 15.7 + 9.3 is 25
     assert [(plane.axis, int(plane.at), plane.flip) for plane in planes] == [(2, 14, False), (0, 16, True)]
 
 
 def test_grey_of_a_plane_is_interpolated_between_voxels_from_minus_200_to_800_hu() -> None:
     volume = make_ball(np.diag([1.0, 1.0, 1.0, 1.0]))
-    plane = Plane("", 0, 16 + 0.487, 1, 2, True)
+    plane = Plane("", axis=0, at=16 + 0.487, across=1, down=2, flip=True)
     between = (1 - 0.487) * volume.voxels[:, :, 16] + 0.487 * volume.voxels[:, :, 17]
     expected = 255 * (between + 200.0) / 1000.0  # down along k, across along j
     rounding = 0.51
@@ -88,19 +93,20 @@ def test_grey_of_a_plane_is_interpolated_between_voxels_from_minus_200_to_800_hu
 @pytest.mark.parametrize("name", ["vtk-mc", "vtk-fe"])
 def test_peers_lie_where_the_scan_is_and_face_outward(name: str, affine: Any, device: Any) -> None:
     volume = make_ball(affine)
-    peer, own = extract_by_vtk(volume, 200, name, True), surface_of(volume, device)
+    peer, own = extract_by_vtk(volume, 200, name, closed=True), surface_of(volume, device)
     assert peer.triangle_count == own.triangle_count
     quality = peer.quality()
     assert quality.closed and quality.outward
     assert quality.volume_ml == pytest.approx(own.quality().volume_ml, rel=2e-4)
     assert clrecon.compare_meshes(peer, own).hd95_mm < 0.05  # measured 0.0014
-    assert peer.report["cells"] == {"visited": 33 * 31 * 29, "all": 33 * 31 * 29}
+    cells = (32 + 1) * (30 + 1) * (28 + 1)  # of the voxels and a border
+    assert peer.report["cells"] == {"visited": cells, "all": cells}
 
 
 def test_surface_of_vtk_is_closed_at_the_border_of_the_volume_on_request(device: Any) -> None:
     volume = make_ball(radius=20.0)
-    assert extract_by_vtk(volume, 200, "vtk-fe", True).quality().closed
-    assert not extract_by_vtk(volume, 200, "vtk-fe", False).quality().closed
+    assert extract_by_vtk(volume, 200, "vtk-fe", closed=True).quality().closed
+    assert not extract_by_vtk(volume, 200, "vtk-fe", closed=False).quality().closed
 
 
 def draw_along_slices(volume: Volume, device: Any) -> Any:
@@ -137,7 +143,7 @@ def test_middle_slice_has_the_size_of_the_picture_along_the_slices() -> None:
 
 def test_uneven_volume_for_other_processes_is_read_again_without_its_report(tmp_path: Path) -> None:
     positions = np.cumsum(np.r_[[[0, 0, 0.0]], np.tile([[0, 0, 1.0], [0, 0, 1.5]], (14, 1))[:27]], axis=0)
-    volume = Volume(make_ball().voxels, np.diag([1, 1, 1.25, 1]), {"secret": "name"}, positions)
+    volume = Volume(make_ball().voxels, np.diag([1, 1, 1.25, 1]), report={"secret": "name"}, slice_positions=positions)
     save_volume(tmp_path, volume)
     again = load_volume(tmp_path)
     np.testing.assert_array_equal(again.voxels, volume.voxels)
@@ -176,12 +182,15 @@ def test_reference_is_measured_as_equal_to_itself(judge: Judge) -> None:
     assert reference["cells"]["dice"] == 1.0
     assert reference["surfaces"]["max_mm"] < 1e-4  # rounding of distances in float64: measured 2e-12
     # the mesh against trilinear HU on a finer lattice than the voxels: measured 0.9994
-    assert reference["slices"]["dice"] > 0.98 and reference["slices"]["voxel_dice"] == 1.0
+    assert reference["slices"]["dice"] > 0.998
+    assert reference["slices"]["voxel_dice"] == 1.0
 
 
 def test_half_of_a_mesh_is_measured_as_open_and_incomplete(judge: Judge) -> None:
     half = judge.measure("vtk-mc")
-    assert half["slices"] is None and "open" in half["reasons"]["slices"] and not half["quality"]["closed"]
+    assert half["slices"] is None
+    assert "open" in half["reasons"]["slices"]
+    assert not half["quality"]["closed"]
     assert half["cells"]["recall"] < 0.7 < 0.9 < half["cells"]["precision"]  # measured 0.5 and 1
 
 
@@ -201,7 +210,7 @@ def record_of(name: str, **more: Any) -> MethodRecord:
         "kernel_seconds": {"a": 0.01, "b": 0.005}, "memory_bytes": 3e8, "memory_before_bytes": 1e8, "triangles": 1000,
         "cells": {"visited": 50, "all": 2000}, "growing": {"cells_left_out_share": 0.25}, "small": [0.4, 0.2],
     }  # fmt: skip
-    return make_record(COMPARED[name], told, {}, {"first": 2.0, "warm": 1.0}).changed(**more)
+    return make_record(COMPARED[name], told, measured={}, read_s={"first": 2.0, "warm": 1.0}).changed(**more)
 
 
 def test_first_time_of_a_method_is_the_sum_of_its_parts_without_reading_and_drawing() -> None:
@@ -234,7 +243,9 @@ def test_small_picture_of_ray_casting_on_the_cpu_is_scaled_to_the_pixels_of_the_
 
 
 def test_failed_method_has_its_error_and_no_times() -> None:
-    failed = make_record(COMPARED["s-mc"], {"state": "failed", "error": "no"}, {}, {"first": 1.0, "warm": 1.0})
+    failed = make_record(
+        COMPARED["s-mc"], {"state": "failed", "error": "no"}, measured={}, read_s={"first": 1.0, "warm": 1.0}
+    )
     assert (failed.is_done, failed.error) == (False, "no")
     assert (failed.first_s, failed.warm_s) == (None, None)
 
@@ -354,7 +365,10 @@ def test_peak_memory_without_a_status_is_asked_of_the_system(tmp_path: Path) -> 
 
 
 CAMERA = {"position": [0, 0, 9.0], "focal_point": [0, 0, 0.0], "up": [0, 1.0, 0], "parallel_scale": 3.0}
-REQUEST = Request("t-mc", "f", 200.0, True, 0, None, 3, 60.0, CAMERA, (48, 40))
+REQUEST = Request(
+    method="t-mc", folder="f", iso_value=200.0, closed=True, device=0, memory=None, repeat=3, timeout=60.0,
+    camera=CAMERA, size=(48, 40),
+)  # fmt: skip
 
 
 def test_request_of_one_camera_has_the_view_of_its_size() -> None:

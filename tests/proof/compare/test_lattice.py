@@ -42,9 +42,9 @@ def points_of(lattice: Lattice) -> np.ndarray:
 
 @pytest.mark.parametrize("closed", [True, False])
 @pytest.mark.parametrize(("finer", "offsets"), [(1, (0.0, 0.0, 0.0)), (3, (0.137, 0.271, 0.389)), (2, (0.0, 0.5, 0.9))])
-@pytest.mark.parametrize("made", [smooth_volume, noise, uneven_noise])
-def test_runs_of_lattice_points_inside_are_those_of_the_trilinear_field(made, finer, offsets, closed):
-    volume = made()
+@pytest.mark.parametrize("make_volume", [smooth_volume, noise, uneven_noise])
+def test_runs_of_lattice_points_inside_are_those_of_the_trilinear_field(make_volume, finer, offsets, closed):
+    volume = make_volume()
     level = float(np.median(volume.voxels)) + 0.37  # which no point has: float32 and float64 agree
     rule = choose_iso_rule(volume, level, closed=closed)
     lattice = Lattice.over(volume, rule, finer, offsets)
@@ -63,7 +63,7 @@ def test_search_for_runs_tells_the_first_layer_of_each_part():
     volume = noise()
     ni, nj, _ = volume.shape_ijk
     rule = choose_iso_rule(volume, float(np.median(volume.voxels)) + 0.37)
-    lattice = Lattice.over(volume, rule, 3, (0.137, 0.271, 0.389))
+    lattice = Lattice.over(volume, rule, finer=3, offsets=(0.137, 0.271, 0.389))
     told: list[int] = []
     find_level_runs(volume, rule, lattice, told.append, most=4 * ni * nj)  # four layers of cells at once
     assert told == list(range(0, lattice.cells_ijk[2], 4))
@@ -81,7 +81,7 @@ def test_search_for_runs_tells_the_first_layer_of_each_part():
 def test_lattice_counts_no_point_of_a_constant_volume_below_the_level_and_all_of_one_above(value, closed, inside):
     volume = Volume(np.full((4, 5, 6), value, np.int16), OBLIQUE)
     rule = choose_iso_rule(volume, 5.0, closed=closed)
-    lattice = Lattice.over(volume, rule, 1, (0.0, 0.0, 0.0))
+    lattice = Lattice.over(volume, rule, finer=1, offsets=(0.0, 0.0, 0.0))
     assert count_points(find_level_runs(volume, rule, lattice, lambda _: None)) == inside
 
 
@@ -98,7 +98,7 @@ def test_lattice_points_inside_a_mesh_are_those_that_vtk_finds():
     from vtkmodules.vtkFiltersModeling import vtkSelectEnclosedPoints
 
     volume = Volume(np.zeros((9, 10, 11), np.int16), OBLIQUE)
-    lattice = Lattice.over(volume, choose_iso_rule(volume, 5.0), 3, (0.137, 0.271, 0.389))
+    lattice = Lattice.over(volume, choose_iso_rule(volume, 5.0), finer=3, offsets=(0.137, 0.271, 0.389))
     vertices, triangles = torus(major=3.0, minor=1.2)
     mesh = Mesh(volume.ijk_to_lps(vertices[:, [0, 2, 1]] + [5.0, 4.5, 4.0]), triangles[:, ::-1])
     keys = find_piercings(volume.lps_to_ijk(mesh.vertices), mesh.triangles, lattice)

@@ -43,13 +43,13 @@ def shell(low: int, high: int) -> set[tuple[int, ...]]:
 
 @pytest.mark.parametrize("affine", [np.eye(4), SHEARED], ids=["even", "sheared"])
 def test_cells_of_a_box_are_those_of_its_six_faces(affine):
-    box_from_2_5_to_7_5 = samples.box((2.5,) * 3, (5.0,) * 3)
+    box_from_2_5_to_7_5 = samples.box(low=(2.5,) * 3, size=(5.0,) * 3)
     assert cells_of(box_from_2_5_to_7_5, grid(affine=affine)) == shell(2, 7)
 
 
 @pytest.mark.parametrize("affine", [np.eye(4), SHEARED], ids=["even", "sheared"])
 def test_box_within_a_cell_passes_through_that_cell_alone(affine):
-    box_from_2_25_to_2_75 = samples.box((2.25,) * 3, (0.5,) * 3)
+    box_from_2_25_to_2_75 = samples.box(low=(2.25,) * 3, size=(0.5,) * 3)
     assert cells_of(box_from_2_25_to_2_75, grid(affine=affine)) == {(2, 2, 2)}
 
 
@@ -62,7 +62,7 @@ def test_faces_between_cells_belong_to_the_upper_ones(affine):
             cell = [u, v]
             cell.insert(axis, plane)
             wanted.add(tuple(cell))
-    assert cells_of(samples.box((2.0,) * 3, (5.0,) * 3), grid(affine=affine)) == wanted
+    assert cells_of(samples.box(low=(2.0,) * 3, size=(5.0,) * 3), grid(affine=affine)) == wanted
 
 
 def test_cells_that_a_diagonal_plane_touches_at_a_corner_alone_are_not_its_cells():
@@ -80,7 +80,7 @@ def test_cells_of_a_triangle_across_the_grid_are_those_of_which_clipping_leaves_
     expected = {cell for cell in within_its_bounds if clip(corners - np.array(cell) - 0.5).size}
 
     assert len(expected) > 64  # more than one part of the search
-    assert cells_of((corners, np.array([[0, 1, 2]])), grid((16, 16, 16), SHEARED)) == expected
+    assert cells_of((corners, np.array([[0, 1, 2]])), grid(shape=(16, 16, 16), affine=SHEARED)) == expected
 
 
 def test_triangles_that_meet_a_box_are_those_of_which_clipping_leaves_a_part():
@@ -145,17 +145,17 @@ EMPTY = Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.uint32))
 
 def test_surface_without_cells_is_not_measured():
     with pytest.raises(NoSurfaceError, match="the surface passes through no cell"):
-        measure_cells(EMPTY, placed(samples.box((2.5,) * 3, (5.0,) * 3), grid()), grid())
+        measure_cells(EMPTY, placed(samples.box(low=(2.5,) * 3, size=(5.0,) * 3), grid()), grid())
 
 
 def test_reference_without_cells_is_not_measured():
     with pytest.raises(NoSurfaceError, match="the reference passes through no cell"):
-        measure_cells(placed(samples.box((2.5,) * 3, (5.0,) * 3), grid()), EMPTY, grid())
+        measure_cells(placed(samples.box(low=(2.5,) * 3, size=(5.0,) * 3), grid()), EMPTY, grid())
 
 
 def test_surface_outside_of_the_grid_is_refused_with_its_extent():
-    box_from_14_to_19 = placed(samples.box((14.5,) * 3, (5.0,) * 3), grid())
-    box = placed(samples.box((2.5,) * 3, (5.0,) * 3), grid())
+    box_from_14_to_19 = placed(samples.box(low=(14.5,) * 3, size=(5.0,) * 3), grid())
+    box = placed(samples.box(low=(2.5,) * 3, size=(5.0,) * 3), grid())
     with refused(UsageError, 14, 19):
         measure_cells(box_from_14_to_19, box, grid())
 
@@ -176,8 +176,8 @@ def test_cell_of_part_numbers_is_refused():
 
 
 def test_cells_of_a_box_beyond_the_grid_are_counted_apart():
-    on = grid((6, 6, 6))
-    found = measure_cells(placed(samples.box((2.5,) * 3, (5.0,) * 3), on), GridCells([[2, 2, 2]]), on)
+    on = grid(shape=(6, 6, 6))
+    found = measure_cells(placed(samples.box(low=(2.5,) * 3, size=(5.0,) * 3), on), GridCells([[2, 2, 2]]), on)
     inside = {cell for cell in shell(2, 7) if max(cell) < 6}
     assert found.cells_outside == found.cells - len(inside)
     assert found.common_cells == 1  # (2, 2, 2) is the first corner of the box

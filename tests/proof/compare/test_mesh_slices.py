@@ -34,7 +34,9 @@ def test_lattice_points_inside_a_box_are_counted_as_by_its_bounds(affine, finer)
     on = block(affine)
     offsets = (0.137, 0.271, 0.389)
     low, side = 2.6, 5.8  # voxels
-    found = measure_slices(placed(samples.box((low,) * 3, (side,) * 3), on), on, 50.0, finer=finer, offsets=offsets)
+    found = measure_slices(
+        placed(samples.box(low=(low,) * 3, size=(side,) * 3), on), on, 50.0, finer=finer, offsets=offsets
+    )
     places = [(np.arange(-99, 99) + offset) / finer for offset in offsets]  # from before the box to behind it
     assert found.points_mesh == np.prod([((low < place) & (place < low + side)).sum() for place in places])
     assert found.rows_odd == 0
@@ -45,8 +47,10 @@ def test_lattice_points_inside_a_box_are_counted_as_by_its_bounds(affine, finer)
 @pytest.mark.parametrize(
     ("mesh", "finer"),
     [
-        pytest.param(samples.box((3.0,) * 3, (5.0,) * 3), 1, id="box with edges on rows"),
-        pytest.param(samples.sphere((5.0, 5.0, 5.0), 3.0, 0), 2, id="octahedron with corners on rows"),
+        pytest.param(samples.box(low=(3.0,) * 3, size=(5.0,) * 3), 1, id="box with edges on rows"),
+        pytest.param(
+            samples.sphere(centre=(5.0, 5.0, 5.0), radius=3.0, rounds=0), 2, id="octahedron with corners on rows"
+        ),
     ],
 )
 def test_rows_through_edges_and_corners_of_a_mesh_cross_it_an_even_number_of_times(mesh, finer):
@@ -56,14 +60,14 @@ def test_rows_through_edges_and_corners_of_a_mesh_cross_it_an_even_number_of_tim
 
 def test_lattice_points_on_the_lower_faces_of_a_box_are_inside_and_on_the_upper_outside():
     on = block()
-    from_3_to_8 = samples.box((3.0,) * 3, (5.0,) * 3)
+    from_3_to_8 = samples.box(low=(3.0,) * 3, size=(5.0,) * 3)
     found = measure_slices(placed(from_3_to_8, on), on, 50.0, finer=1, offsets=(0, 0, 0))
     assert found.points_mesh == len([3, 4, 5, 6, 7]) ** 3
 
 
 def test_mesh_that_is_open_across_many_rows_is_refused():
     on = block()
-    vertices, triangles = samples.box((2.6,) * 3, (5.8,) * 3)
+    vertices, triangles = samples.box(low=(2.6,) * 3, size=(5.8,) * 3)
     faced = np.flatnonzero(np.ptp(vertices[triangles][:, :, 0], axis=1) == 0.0)  # across the rows
     with refused(UsageError, "mesh", "open"):
         measure_slices(placed((vertices, np.delete(triangles, faced[0], axis=0)), on), on, 50.0)
@@ -71,7 +75,7 @@ def test_mesh_that_is_open_across_many_rows_is_refused():
 
 def test_rows_through_a_small_hole_are_left_out_of_mesh_and_volume():
     on = block(size=20, low=5, high=14)
-    vertices, triangles = samples.sphere((9.5, 9.5, 9.5), 6.0, 3)
+    vertices, triangles = samples.sphere(centre=(9.5, 9.5, 9.5), radius=6.0, rounds=3)
     # The triangle nearest to the pole of the rows: they leave the ball through the hole.
     hole = int(np.argmin(np.linalg.norm(vertices[triangles].mean(axis=1) - [15.5, 9.5, 9.5], axis=1)))
     whole = measure_slices(placed((vertices, triangles), on), on, 50.0, finer=5)
@@ -91,7 +95,7 @@ def test_empty_mesh_is_refused():
 
 def test_mesh_beyond_the_volume_is_refused_with_its_bounds():
     on = block()
-    beyond = placed(samples.box((2.6, 30.0, 2.6), (5.8,) * 3), on)
+    beyond = placed(samples.box(low=(2.6, 30.0, 2.6), size=(5.8,) * 3), on)
     with refused(UsageError, "volume", 2.6, 30.0):
         measure_slices(beyond, on, 50.0)
 
@@ -108,4 +112,4 @@ def test_mesh_beyond_the_volume_is_refused_with_its_bounds():
 def test_wrong_argument_of_a_comparison_of_slices_is_refused_with_its_value(arguments, facts):
     on = block()
     with refused(UsageError, *facts):
-        measure_slices(placed(samples.box((2.6,) * 3, (5.8,) * 3), on), on, **arguments)
+        measure_slices(placed(samples.box(low=(2.6,) * 3, size=(5.8,) * 3), on), on, **arguments)

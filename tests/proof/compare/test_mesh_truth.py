@@ -44,12 +44,12 @@ class Ring:
 
 
 def ball(radius=RADIUS, shift=(0.0, 0.0, 0.0), rounds=5) -> Mesh:
-    return Mesh(*samples.sphere(CENTRE + shift, radius, rounds))
+    return Mesh(*samples.sphere(centre=CENTRE + shift, radius=radius, rounds=rounds))
 
 
 @pytest.mark.parametrize("more", [0.3, -0.4])
 def test_larger_or_smaller_ball_has_its_difference_as_bias_and_no_scatter(more):
-    found = measure_truth(ball(RADIUS + more), Ball())
+    found = measure_truth(ball(radius=RADIUS + more), Ball())
     assert found.bias_mm == pytest.approx(more, abs=tolerances.BALL_SAGITTA_MM)
     assert found.scatter_mm < tolerances.BALL_SAGITTA_MM
     assert found.p95_mm == pytest.approx(abs(more), abs=tolerances.BALL_SAGITTA_MM)
@@ -67,13 +67,13 @@ def test_shifted_ball_has_no_bias_and_the_scatter_of_its_shift():
 
 
 def test_torus_with_a_thicker_tube_has_that_bias_and_no_scatter():
-    found = measure_truth(Mesh(*samples.torus(300, 120, minor=6.25)), Ring())
+    found = measure_truth(Mesh(*samples.torus(rings=300, sides=120, major=20.0, minor=6.25)), Ring())
     assert found.bias_mm == pytest.approx(0.25, abs=tolerances.BALL_SAGITTA_MM)
     assert found.scatter_mm < tolerances.BALL_SAGITTA_MM
 
 
 def test_wall_of_a_cavity_is_not_measured_as_outer_surface():
-    outer, inner = ball(RADIUS + 0.2), ball(RADIUS - 0.8)
+    outer, inner = ball(radius=RADIUS + 0.2), ball(radius=RADIUS - 0.8)
     vertices, triangles = samples.join((outer.vertices, outer.triangles), (inner.vertices, inner.triangles[:, ::-1]))
     found = measure_truth(Mesh(vertices, triangles), Ball())
     assert found.bias_mm == pytest.approx(0.2, abs=tolerances.BALL_SAGITTA_MM)
@@ -86,7 +86,7 @@ def test_mesh_beyond_the_reach_of_its_truth_is_left_out():
     found = measure_truth(both, Ball())
     assert found.max_mm < tolerances.BALL_SAGITTA_MM
     assert found.outer_share == pytest.approx(RADIUS**2 / (RADIUS**2 + 3.0**2), abs=2e-3)  # areas
-    assert found.reach_mm == 1.5
+    assert found.reach_mm == 1.5  # where no grid is given
 
 
 def test_mesh_that_is_wholly_beyond_the_reach_of_its_truth_is_refused():
@@ -102,8 +102,8 @@ def test_mesh_whose_faces_look_inwards_is_refused():
 
 def test_flat_cut_at_the_border_of_the_scan_is_left_out_of_the_measures():
     grid = Volume(np.zeros((21, 41, 41), np.int16), np.diag([1.0, 1.0, 2.0, 1.0]))
-    truth = Ball((20.0, 20.0, 4.0))
-    vertices, triangles = samples.sphere((20.0, 20.0, 4.0), 10.2, 5)
+    truth = Ball((20.0, 20.0, 4.0), radius=10.0)
+    vertices, triangles = samples.sphere(centre=(20.0, 20.0, 4.0), radius=10.2, rounds=5)
     cut = Mesh(np.maximum(vertices, [-99.0, -99.0, 0.0]), triangles)  # what lies below the grid is pressed flat
     found = measure_truth(cut, truth, grid=grid)
     assert found.bias_mm == pytest.approx(0.2, abs=tolerances.BALL_SAGITTA_MM)
@@ -121,7 +121,7 @@ def test_truth_without_a_distance_is_refused_by_its_type():
 
 def test_measure_of_no_samples_is_refused():
     with refused(UsageError, 1, "sample"):
-        measure_truth(ball(), Ball(), 0)
+        measure_truth(ball(), Ball(), samples=0)
 
 
 @pytest.mark.parametrize("reach_mm", [0.0, -1.0, np.nan, np.inf])
@@ -138,7 +138,7 @@ def test_empty_mesh_is_refused_where_it_is_compared_with_a_truth():
 @pytest.mark.parametrize("affine", [np.eye(4), SHEARED], ids=["even", "sheared"])
 def test_cells_cut_by_a_truth_are_those_of_a_search_of_all_their_points_with_a_tenth_of_them(affine):
     grid = Volume(np.zeros((19, 33, 40), np.int16), affine)
-    truth = Ball(grid.ijk_to_lps([[24.0, 18.0, 8.0]])[0], 7.5)
+    truth = Ball(centre=grid.ijk_to_lps([[24.0, 18.0, 8.0]])[0], radius=7.5)
     low = np.array(list(itertools.product(range(-1, 40), range(-1, 33), range(-1, 19))))
     points = low[:, None] + 0.5 * np.array(list(itertools.product(range(3), repeat=3)))
     within = truth.signed_distance(grid.ijk_to_lps(points.reshape(-1, 3))).reshape(len(low), 27) < 0.0
@@ -163,11 +163,12 @@ def test_cells_cut_by_the_surface_of_a_phantom_lie_within_half_their_diagonal_of
 
 def test_cells_of_a_fine_mesh_of_a_ball_are_those_cut_by_the_ball():
     grid = Volume(np.zeros((33, 33, 33), np.int16), np.eye(4))
-    truth = Ball((16.2, 15.9, 16.4))
-    mesh = Mesh(*samples.sphere((16.2, 15.9, 16.4), RADIUS, 6))
+    truth = Ball((16.2, 15.9, 16.4), radius=RADIUS)
+    mesh = Mesh(*samples.sphere(centre=(16.2, 15.9, 16.4), radius=RADIUS, rounds=6))
     found = measure_cells(mesh, find_cut_cells(truth, grid), grid)
     assert found.reference == "truth"
-    assert found.recall > 0.99 and found.precision > 0.97  # corners between the 27 points of a cell
+    assert found.recall > 0.99  # corners between the 27 points of a cell
+    assert found.precision > 0.97
     assert measure_cells(mesh, find_mesh_cells(mesh, grid, name="t-mc"), grid).dice == 1.0
 
 
@@ -179,4 +180,5 @@ def test_wall_beside_the_outermost_voxels_cuts_the_cells_of_the_border(axis, at)
             return np.asarray(points_mm)[:, axis] - at
 
     found = find_cut_cells(Wall(), Volume(np.zeros((6, 6, 6), np.int16), np.eye(4))).ijk
-    assert set(found[:, axis].tolist()) == {int(np.floor(at))} and len(found) == 7 * 7
+    assert set(found[:, axis].tolist()) == {int(np.floor(at))}
+    assert len(found) == 7 * 7  # of 6 voxels and a border

@@ -34,7 +34,7 @@ OLDER_SETTINGS = {
 def plan_vertebrae(levels: str, **choice: object) -> list[Vertebra]:
     """Vertebrae of a spine in the middle of a field of 500 mm."""
     chosen = SpineChoice(parse_levels(levels), **choice)  # type: ignore[arg-type]
-    return plan_anatomy((250.0, 250.0, 0.0), np.eye(3), 0, chosen).vertebrae
+    return plan_anatomy(field_of_view_mm=(250.0, 250.0, 0.0), steps_mm=np.eye(3), seed=0, choice=chosen).vertebrae
 
 
 def distances_of_neighbours(vertebrae: list[Vertebra]) -> list[float]:

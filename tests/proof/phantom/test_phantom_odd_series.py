@@ -60,8 +60,9 @@ def test_gaps_of_uneven_slices_differ_from_the_mean_by_no_more_than_asked(
 
 
 def test_uneven_slices_are_warned_of(uneven_series: tuple[Path, PhantomSettings, dict]) -> None:
-    warnings = list_series(uneven_series[0]).series[0].warnings
-    assert any("unevenly spaced" in text for text in warnings)
+    folder, _, _ = uneven_series
+    (series,) = list_series(folder).series
+    assert any("unevenly spaced" in text for text in series.warnings)
 
 
 def test_voxels_of_written_uneven_slices_are_those_of_the_phantom(
@@ -89,8 +90,8 @@ def test_blur_of_slices_at_even_places_is_that_of_an_even_volume() -> None:
     affine = np.diag((1.0, 1.0, 2.0, 1.0))
     noise = np.random.default_rng(0).normal(0.0, 100.0, (9, 6, 5)).astype(np.float32)
 
-    by_affine = apply_point_spread(noise.copy(), affine, 1.5)
-    by_places = apply_point_spread(noise.copy(), affine, 1.5, places=np.arange(9.0))
+    by_affine = apply_point_spread(noise.copy(), affine, sigma_mm=1.5)
+    by_places = apply_point_spread(noise.copy(), affine, sigma_mm=1.5, places=np.arange(9.0))
 
     middle = 4  # the ends differ: beyond them one of both has nothing
     assert by_places[middle] == pytest.approx(by_affine[middle], abs=0.2)  # HU; weights end at four sigma
@@ -100,7 +101,7 @@ def test_blur_between_uneven_slices_leaves_a_constant_volume_as_it_is() -> None:
     affine = np.diag((1.0, 1.0, 2.0, 1.0))
     constant = np.full((9, 6, 5), 7.0, np.float32)
     uneven_places = np.arange(9) + np.array([0, 0.2, -0.1, 0.1, 0, -0.2, 0.1, 0, 0])
-    blurred = apply_point_spread(constant.copy(), affine, 1.5, places=uneven_places)
+    blurred = apply_point_spread(constant.copy(), affine, sigma_mm=1.5, places=uneven_places)
     assert blurred == pytest.approx(constant, abs=1e-5)  # sums in float32
 
 
@@ -119,29 +120,32 @@ def test_missing_slices_have_no_files(series_with_gaps: tuple[Path, dict]) -> No
 
 
 def test_series_with_missing_slices_is_refused_with_its_two_gaps(series_with_gaps: tuple[Path, dict]) -> None:
+    folder, _ = series_with_gaps
     gaps = 2  # slices 8 and 9, and slice 15
     with refused(RefusedInputError, "allow_gaps=True", gaps):
-        read_volume(series_with_gaps[0])
+        read_volume(folder)
 
 
 def test_series_with_allowed_gaps_has_the_other_slices_and_the_number_of_missing_ones(
     series_with_gaps: tuple[Path, dict],
 ) -> None:
-    volume = read_volume(series_with_gaps[0], allow_gaps=True)
+    folder, _ = series_with_gaps
+    volume = read_volume(folder, allow_gaps=True)
 
-    whole = make_phantom(PhantomSettings(**SMALL))[0]
+    whole, _, _ = make_phantom(PhantomSettings(**SMALL))
     assert np.array_equal(volume.voxels, np.delete(whole, [8 - 1, 9 - 1, 15 - 1], axis=0))
     assert volume.report["slices_missing"] == 3
 
 
 def test_voxels_of_a_phantom_with_missing_slices_are_those_of_the_others() -> None:
-    whole = make_phantom(PhantomSettings(**SMALL))[0]
-    with_gaps = make_phantom(PhantomSettings(**SMALL, missing=(9, 8, 15)))[0]
+    whole, _, _ = make_phantom(PhantomSettings(**SMALL))
+    with_gaps, _, _ = make_phantom(PhantomSettings(**SMALL, missing=(9, 8, 15)))
     assert np.array_equal(with_gaps, np.delete(whole, [8 - 1, 9 - 1, 15 - 1], axis=0))
 
 
 @pytest.fixture(scope="module")
 def series_of_three_phases(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three times 20 slices without noise."""
     folder = tmp_path_factory.mktemp("phases") / "ct"
     write_phantom(folder, PhantomSettings(**SMALL, **CLEAN, phases=3))
     return folder
@@ -149,7 +153,7 @@ def series_of_three_phases(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.release
 def test_series_of_three_phases_is_listed_with_the_slices_of_each(series_of_three_phases: Path) -> None:
-    entry = list_series(series_of_three_phases).series[0]
+    (entry,) = list_series(series_of_three_phases).series
     assert [phase["slices"] for phase in entry.phases] == [20, 20, 20]
     assert entry.slices == 60
 
@@ -214,7 +218,7 @@ def test_text_of_a_screen_capture_has_lines_of_a_24th_of_its_height_as_far_apart
     rows, margin = 96, 8
     voxels = np.zeros((12, rows, 128), np.int16)
 
-    capture = draw_ghosts(voxels, 0)["slices"][0]["slice"]
+    capture, _ = (ghost["slice"] for ghost in draw_ghosts(voxels, seed=0)["slices"])
 
     within_the_margin = voxels[capture, margin:-margin, margin:-margin]
     text_rows = margin + np.flatnonzero((within_the_margin == TEXT_HU).any(axis=1))

@@ -22,10 +22,10 @@ SHAPE = (27, 95, 71)
 MIDDLE = apply_affine(SHEARED, [(35.3, 46.8, 13.1)])[0]
 AXIS = (0.36, -0.48, 0.8)
 BODIES = [
-    Sphere(MIDDLE, 9.5),
-    Torus(MIDDLE, AXIS, 8.0, 3.6),
-    Cylinder(MIDDLE, AXIS, 5.5, 14.0),
-    Box(MIDDLE, AXIS, 7.0, 13.0, 11.0),
+    Sphere(MIDDLE, radius=9.5),
+    Torus(MIDDLE, AXIS, major=8.0, minor=3.6),
+    Cylinder(MIDDLE, AXIS, radius=5.5, length=14.0),
+    Box(MIDDLE, AXIS, thickness=7.0, width=13.0, height=11.0),
 ]
 IDS = ["sphere", "torus", "cylinder", "box"]
 
@@ -62,7 +62,7 @@ def test_body_within_the_grid_has_no_share_of_the_outermost_voxels(sampled_body:
 
 def test_partial_volumes_of_a_sphere_of_five_voxels_add_up_to_its_volume() -> None:
     affine = compose_affine((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.4, 1.0), (0.0, 0.0, 0.0))  # voxels of 1 mm3
-    sphere = Sphere(apply_affine(affine, [(8.2, 7.9, 7.6)])[0], 5.0)
+    sphere = Sphere(apply_affine(affine, [(8.2, 7.9, 7.6)])[0], radius=5.0)
     total_ml = float(sample_occupancy(sphere, affine, (16, 17, 18)).sum(dtype=np.float64)) / 1000.0
     assert total_ml == pytest.approx(sphere.volume_ml, rel=tolerances.PHANTOM_VOLUME_RATIO)
 
@@ -111,9 +111,9 @@ TURNED_MIDDLE = apply_affine(TURNED, [(31.2, 29.6, 22.3)])[0]
 @pytest.mark.parametrize(
     "body",
     [
-        pytest.param(Sphere(TURNED_MIDDLE, 9.5), id="sphere"),
-        pytest.param(Torus(TURNED_MIDDLE, AXIS, 9.0, 4.6), id="torus"),
-        pytest.param(Cylinder(TURNED_MIDDLE, AXIS, 6.5, 16.0), id="cylinder"),
+        pytest.param(Sphere(TURNED_MIDDLE, radius=9.5), id="sphere"),
+        pytest.param(Torus(TURNED_MIDDLE, AXIS, major=9.0, minor=4.6), id="torus"),
+        pytest.param(Cylinder(TURNED_MIDDLE, AXIS, radius=6.5, length=16.0), id="cylinder"),
     ],
 )
 def test_half_share_surface_of_a_body_has_its_area_and_volume_and_lies_on_it(body) -> None:
@@ -142,24 +142,24 @@ def draw_noise_volume() -> tuple[np.ndarray, np.ndarray]:
 def test_point_spread_is_the_gaussian_filter_of_scipy_in_mm() -> None:
     voxels, affine = draw_noise_volume()
     expected = gaussian_filter(voxels.astype(np.float64), (0.9 / 2.5, 0.9 / 0.5, 0.9 / 0.7), mode="nearest")
-    blurred = apply_point_spread(voxels.copy(), affine, 0.9)
+    blurred = apply_point_spread(voxels.copy(), affine, sigma_mm=0.9)
     assert np.abs(blurred - expected).max() < tolerances.PHANTOM_BLUR_HU
 
 
 def test_point_spread_of_0_mm_changes_no_voxel() -> None:
     voxels, affine = draw_noise_volume()
-    assert np.array_equal(apply_point_spread(voxels.copy(), affine, 0.0), voxels)
+    assert np.array_equal(apply_point_spread(voxels.copy(), affine, sigma_mm=0.0), voxels)
 
 
 def test_negative_point_spread_is_refused_with_its_value() -> None:
     voxels, affine = draw_noise_volume()
     with refused(UsageError, -1):
-        apply_point_spread(voxels, affine, -1.0)
+        apply_point_spread(voxels, affine, sigma_mm=-1.0)
 
 
 def draw_noise(seed: int) -> np.ndarray:
     """Noise of 25 HU alone."""
-    return add_noise(np.zeros((9, 64, 71), np.float32), 25.0, seed)
+    return add_noise(np.zeros((9, 64, 71), np.float32), sigma_hu=25.0, seed=seed)
 
 
 def test_noise_has_the_asked_deviation_about_0() -> None:

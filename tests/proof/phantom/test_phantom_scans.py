@@ -100,7 +100,7 @@ def test_volume_of_bone_in_the_truth_is_its_number_of_voxels_times_their_size(
 def test_cupping_falls_with_the_square_of_the_distance_from_the_centre(rows_up: int, columns_right: int) -> None:
     field = np.zeros((2, 41, 61), np.float32)  # its centre: row 20, column 30
 
-    add_cupping(field, np.diag((0.5, 0.5, 1.0, 1.0)), 100.0)
+    add_cupping(field, np.diag((0.5, 0.5, 1.0, 1.0)), cupping_hu=100.0)
 
     share_of_radius = max(rows_up, columns_right) / 20.5  # half the shorter side
     found = field[:, 20 - rows_up, 30 + columns_right]
@@ -109,7 +109,7 @@ def test_cupping_falls_with_the_square_of_the_distance_from_the_centre(rows_up: 
 
 def test_cupping_changes_nothing_outside_of_the_disc_of_the_field() -> None:
     field = np.zeros((2, 41, 61), np.float32)  # the disc reaches from column 9.5 to 50.5
-    add_cupping(field, np.diag((0.5, 0.5, 1.0, 1.0)), 100.0)
+    add_cupping(field, np.diag((0.5, 0.5, 1.0, 1.0)), cupping_hu=100.0)
     assert (field[:, :, :9] == 0.0).all()
 
 
@@ -126,7 +126,7 @@ def mark_two_pieces_of_metal() -> np.ndarray:
 def draw_streaks(metal: np.ndarray) -> np.ndarray:
     """Streaks of the metal alone, HU."""
     field = np.zeros(metal.shape, np.float32)
-    add_streaks(field, metal, METAL_HU, np.eye(4), 1.0, seed=4)
+    add_streaks(field, metal, METAL_HU, np.eye(4), strength=1.0, seed=4)
     return field
 
 

@@ -132,7 +132,8 @@ def test_prone_head_has_the_same_values_at_the_same_places_in_a_turned_image() -
         i, j, k = np.rint(apply_affine(np.linalg.inv(affine), centre_lps_mm + offsets)).astype(int).T
         values.append(voxels[k, j, i].astype(float))
 
-    assert np.sign(np.diag(prone[1])[:3]).tolist() == [-1.0, -1.0, 1.0]
+    _, affine_of_prone, _ = prone
+    assert np.sign(np.diag(affine_of_prone)[:3]).tolist() == [-1.0, -1.0, 1.0]
     assert np.corrcoef(values)[0, 1] > 0.9  # nearest voxels of two grids
 
 

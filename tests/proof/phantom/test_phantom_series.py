@@ -46,7 +46,9 @@ def extra(request: pytest.FixtureRequest) -> dict:
 
 
 @pytest.fixture(scope="module", params=daily(1, ["sphere", "spine"]))
-def written(request: pytest.FixtureRequest, extra: dict, tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+def written_phantom(
+    request: pytest.FixtureRequest, extra: dict, tmp_path_factory: pytest.TempPathFactory
+) -> SimpleNamespace:
     """A phantom as asked for, as told by its truth, and as its files hold it."""
     folder = tmp_path_factory.mktemp("phantom") / "ct"
     settings = PhantomSettings(kind=request.param, **AWKWARD, **extra)
@@ -55,34 +57,42 @@ def written(request: pytest.FixtureRequest, extra: dict, tmp_path_factory: pytes
     return SimpleNamespace(folder=folder, settings=settings, truth=truth, hu=hu, affine=affine, headers=headers)
 
 
-def test_written_series_has_the_affine_and_voxels_of_its_truth(written: SimpleNamespace) -> None:
-    voxels, affine, truth = make_phantom(written.settings)
-    assert written.truth == truth == json.loads((written.folder / "truth.json").read_text())
-    assert np.array_equal(written.hu, voxels)
+def test_written_series_has_the_affine_and_voxels_of_its_truth(written_phantom: SimpleNamespace) -> None:
+    voxels, affine, truth = make_phantom(written_phantom.settings)
+    assert written_phantom.truth == truth == json.loads((written_phantom.folder / "truth.json").read_text())
+    assert np.array_equal(written_phantom.hu, voxels)
     assert np.array_equal(affine, truth["affine_ijk_to_lps_mm"])
-    assert written.affine == pytest.approx(affine, abs=tolerances.PHANTOM_POSITION_MM)
+    assert written_phantom.affine == pytest.approx(affine, abs=tolerances.PHANTOM_POSITION_MM)
 
 
-def test_written_series_has_the_size_spacing_and_tilt_of_its_settings(written: SimpleNamespace, extra: dict) -> None:
-    row, column, step = written.affine[:3, :3].T
+def test_written_series_has_the_size_spacing_and_tilt_of_its_settings(
+    written_phantom: SimpleNamespace, extra: dict
+) -> None:
+    row, column, step = written_phantom.affine[:3, :3].T
     normal = np.cross(row, column)
-    assert list(written.hu.shape[::-1]) == written.truth["shape_ijk"] == [38, 30, 14]
-    assert [np.linalg.norm(row), np.linalg.norm(column)] == pytest.approx([0.5, 0.7])
-    assert step @ normal / np.linalg.norm(normal) == pytest.approx(2.5, abs=1e-9)
-    assert written.truth["tilt_deg"] == pytest.approx(extra.get("tilt", 0.0), abs=1e-6)
+    assert (
+        list(written_phantom.hu.shape[::-1])
+        == written_phantom.truth["shape_ijk"]
+        == [*AWKWARD["size"], AWKWARD["slices"]]
+    )
+    along_column, along_row, gap = AWKWARD["spacing"]
+    assert [np.linalg.norm(row), np.linalg.norm(column)] == pytest.approx([along_row, along_column])
+    assert step @ normal / np.linalg.norm(normal) == pytest.approx(gap, abs=1e-9)
+    assert written_phantom.truth["tilt_deg"] == pytest.approx(extra.get("tilt", 0.0), abs=1e-6)
 
 
-def test_headers_of_a_phantom_are_those_of_a_ct(written: SimpleNamespace, extra: dict) -> None:
-    first = written.headers[0]
+def test_headers_of_a_phantom_are_those_of_a_ct(written_phantom: SimpleNamespace, extra: dict) -> None:
+    first = written_phantom.headers[0]
     assert first.file_meta.TransferSyntaxUID.is_implicit_VR == (extra.get("transfer_syntax") == "implicit")
-    assert first.SOPClassUID == pydicom.uid.CTImageStorage and first.PatientPosition == "HFS"
+    assert first.SOPClassUID == pydicom.uid.CTImageStorage
+    assert first.PatientPosition == "HFS"
     assert (first.BitsStored, first.PixelRepresentation, first.RescaleIntercept) == (16, 1, -1024)
     assert ("GantryDetectorTilt" in first) == ("tilt" in extra)
 
 
-def test_slices_of_a_phantom_are_of_one_series_and_have_names_of_their_own(written: SimpleNamespace) -> None:
-    assert len({header.SOPInstanceUID for header in written.headers}) == 14
-    assert len({header.SeriesInstanceUID for header in written.headers}) == 1
+def test_slices_of_a_phantom_are_of_one_series_and_have_names_of_their_own(written_phantom: SimpleNamespace) -> None:
+    assert len({header.SOPInstanceUID for header in written_phantom.headers}) == AWKWARD["slices"]
+    assert len({header.SeriesInstanceUID for header in written_phantom.headers}) == 1
 
 
 def test_decimal_strings_of_a_written_series_have_at_most_16_characters(tmp_path: Path) -> None:
@@ -188,7 +198,10 @@ def spines_by_seed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[s
 
 @pytest.mark.release
 def test_files_of_a_phantom_are_its_numbered_slices_and_its_truth(spines_by_seed: dict) -> None:
-    assert sorted(spines_by_seed["seed 3"]) == [*(f"IM{n:04d}.dcm" for n in range(1, 15)), "truth.json"]
+    assert sorted(spines_by_seed["seed 3"]) == [
+        *(f"IM{n:04d}.dcm" for n in range(1, AWKWARD["slices"] + 1)),
+        "truth.json",
+    ]
 
 
 @pytest.mark.release
@@ -216,6 +229,7 @@ def files_in(folder: Path) -> dict[str, bytes]:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
+    """An empty folder."""
     (tmp_path / "ct").mkdir()
     return tmp_path / "ct"
 

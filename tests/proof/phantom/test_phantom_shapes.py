@@ -17,10 +17,10 @@ CENTRE = np.array((3.0, -14.0, 25.0))
 ACROSS = np.array((0.8, 0.6, 0.0))
 THIRD = np.cross(AXIS, ACROSS)
 
-SPHERE = Sphere(CENTRE, 9.0)
-TORUS = Torus(CENTRE, 2.0 * AXIS, 11.0, 4.0)
-CYLINDER = Cylinder(CENTRE, -3.0 * AXIS, 6.0, 17.0)
-BOX = Box(CENTRE, AXIS, 5.0, 12.0, 16.0, edge=ACROSS + 0.5 * AXIS)
+SPHERE = Sphere(CENTRE, radius=9.0)
+TORUS = Torus(CENTRE, 2.0 * AXIS, major=11.0, minor=4.0)
+CYLINDER = Cylinder(CENTRE, -3.0 * AXIS, radius=6.0, length=17.0)
+BOX = Box(CENTRE, AXIS, thickness=5.0, width=12.0, height=16.0, edge=ACROSS + 0.5 * AXIS)
 BODIES = [SPHERE, TORUS, CYLINDER, BOX]
 IDS = ["sphere", "torus", "cylinder", "box"]
 
@@ -131,12 +131,12 @@ def test_description_of_a_box_has_its_thickness_and_its_edge_across_the_axis() -
 @pytest.mark.parametrize(
     ("make", "says"),
     [
-        (lambda: Sphere((0, 0, 0), 0.0), "radius"),
-        (lambda: Sphere((0, 0), 1.0), "three finite numbers"),
-        (lambda: Torus((0, 0, 0), (0, 0, 0), 3.0, 1.0), "zero vector"),
-        (lambda: Torus((0, 0, 0), (0, 0, 1), 3.0, 3.0), "minor 3 and major 3"),
-        (lambda: Cylinder((0, 0, 0), (0, 0, 1), 3.0, math.nan), "length"),
-        (lambda: Box((0, 0, 0), (0, 0, 1), 1.0, 1.0, 1.0, edge=(0, 0, 2)), "parallel"),
+        (lambda: Sphere((0, 0, 0), radius=0.0), "radius"),
+        (lambda: Sphere((0, 0), radius=1.0), "three finite numbers"),
+        (lambda: Torus((0, 0, 0), (0, 0, 0), major=3.0, minor=1.0), "zero vector"),
+        (lambda: Torus((0, 0, 0), (0, 0, 1), major=3.0, minor=3.0), "minor 3 and major 3"),
+        (lambda: Cylinder((0, 0, 0), (0, 0, 1), radius=3.0, length=math.nan), "length"),
+        (lambda: Box((0, 0, 0), (0, 0, 1), thickness=1.0, width=1.0, height=1.0, edge=(0, 0, 2)), "parallel"),
         (lambda: SPHERE.signed_distance(np.zeros((3, 2))), r"\(3, 2\)"),
     ],
 )

@@ -17,6 +17,7 @@ CLEAN = {"noise": 0.0, "point_spread_mm": 0.0}
 
 @pytest.fixture(scope="module")
 def spine() -> tuple:
+    """Voxels, affine and truth of a spine in 68 slices of 2.2 mm."""
     return make_phantom(PhantomSettings(size=(176, 160), slices=68, spacing=(1.6, 1.5, 2.2)))
 
 
@@ -45,12 +46,14 @@ def most_frequent(voxels: np.ndarray, low: float, high: float) -> float:
 def test_histogram_of_a_spine_peaks_at_the_value_of_a_tissue(
     spine: tuple, between_hu: tuple[float, float], peak_hu: tuple[float, float]
 ) -> None:
-    assert peak_hu[0] <= most_frequent(spine[0], *between_hu) <= peak_hu[1]
+    voxels, _, _ = spine
+    lowest, highest = peak_hu
+    assert lowest <= most_frequent(voxels, *between_hu) <= highest
 
 
 @pytest.mark.release
 def test_one_to_six_percent_of_the_voxels_of_a_spine_are_bone_some_above_1000_hu(spine: tuple) -> None:
-    voxels = spine[0]
+    voxels, _, _ = spine
     assert 0.01 < (voxels > 226).mean() < 0.06  # HU of the default preset of bone
     assert (voxels > 500).sum() > 5000  # of 1.9 million: cortex
     assert voxels.max() > 1000
@@ -58,9 +61,10 @@ def test_one_to_six_percent_of_the_voxels_of_a_spine_are_bone_some_above_1000_hu
 
 @pytest.mark.release
 def test_air_of_a_spine_has_noise_of_less_than_40_hu(spine: tuple) -> None:
-    air = spine[0][0, :3, :3]  # the corner of a slice
+    voxels, _, _ = spine
+    air = voxels[0, :3, :3]  # the corner of a slice
     assert air.std() < 40.0
-    assert spine[0].min() > -1100  # air has -1000; measured -1056
+    assert voxels.min() > -1100  # air has -1000; measured -1056
 
 
 @pytest.mark.parametrize("dk", daily(1, [3.0, 8.0]), ids=["thin slices", "thick slices"])
@@ -73,11 +77,13 @@ def test_most_frequent_values_are_those_of_air_couch_lung_fat_and_muscle(dk: flo
 
 def centres_in_view(spine: tuple) -> np.ndarray:
     """Centres of the vertebral bodies within the slices from above, LPS mm."""
-    return np.array([level["center_lps_mm"] for level in spine[2]["spine"]["vertebrae"] if level["inside"]])
+    _, _, truth = spine
+    return np.array([level["center_lps_mm"] for level in truth["spine"]["vertebrae"] if level["inside"]])
 
 
 def test_spine_of_150_mm_shows_five_levels_from_above_more_than_24_mm_apart(spine: tuple) -> None:
-    names = [level["name"] for level in spine[2]["spine"]["vertebrae"] if level["inside"]]
+    _, _, truth = spine
+    names = [level["name"] for level in truth["spine"]["vertebrae"] if level["inside"]]
     assert names == ["T10", "T11", "T12", "L1", "L2"]
     assert np.all(np.diff(centres_in_view(spine)[:, 2]) < -24.0)  # z grows upwards
 
@@ -96,15 +102,17 @@ def test_half_way_between_vertebral_bodies_is_a_disc(spine: tuple) -> None:
 
 
 def centre_of_t12(spine: tuple) -> np.ndarray:
-    return np.array(next(v["center_lps_mm"] for v in spine[2]["spine"]["vertebrae"] if v["name"] == "T12"))
+    _, _, truth = spine
+    return np.array(next(v["center_lps_mm"] for v in truth["spine"]["vertebrae"] if v["name"] == "T12"))
 
 
 def test_left_marker_lies_on_the_left_alone(spine: tuple) -> None:
-    marker = np.array(spine[2]["spine"]["left_marker_lps_mm"])
+    _, _, truth = spine
+    marker = np.array(truth["spine"]["left_marker_lps_mm"])
     middle_x = -3.5  # of the phantom
     mirrored = marker * (-1, 1, 1) + (2.0 * middle_x, 0, 0)
 
-    assert spine[2]["spine"]["left_marker_inside"]
+    assert truth["spine"]["left_marker_inside"]
     assert marker[0] > centre_of_t12(spine)[0] + 50.0  # x grows to the left
     assert values_at(spine, marker[None])[0] > 1200
     assert values_at(spine, mirrored[None])[0] < 200  # neither metal nor bone; measured -112, as fat has
@@ -154,7 +162,7 @@ def test_voxels_between_muscle_and_cortex_have_many_values_of_partial_volume() -
 
 @pytest.mark.parametrize("name", ["T6", "L3"])
 def test_bone_of_a_vertebra_surrounds_its_canal_and_leaves_it_free(name: str) -> None:
-    anatomy = plan_anatomy((250.0, 250.0, 150.0), np.eye(3), seed=1)
+    anatomy = plan_anatomy(field_of_view_mm=(250.0, 250.0, 150.0), steps_mm=np.eye(3), seed=1)
     [vertebra] = [each for each in anatomy.vertebrae if each.name == name]
     middle_of_canal = vertebra.depth / 2.0 + vertebra.canal_half_depth - 0.8
     angles = np.linspace(0.0, 2.0 * np.pi, 73)[None, :]
@@ -175,7 +183,7 @@ def test_bone_of_a_vertebra_surrounds_its_canal_and_leaves_it_free(name: str) ->
 
 @pytest.fixture(scope="module")
 def whole_spine() -> Anatomy:
-    return plan_anatomy((300.0, 300.0, 450.0), np.eye(3), seed=0)
+    return plan_anatomy(field_of_view_mm=(300.0, 300.0, 450.0), steps_mm=np.eye(3), seed=0)
 
 
 def behind_the_chord(spine: Anatomy, top: str, apex: str, bottom: str) -> float:

@@ -61,7 +61,7 @@ def test_distances_are_those_of_a_dense_cover_of_the_surface(
     case: str, near: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     truth = truth_of(case)
-    points = points_near(truth, 1500, 0.6) if near else points_around(truth, 1500, 30.0)
+    points = points_near(truth, 1500, spread_mm=0.6) if near else points_around(truth, 1500, margin_mm=30.0)
 
     found = np.abs(truth.signed_distance(points))
 
@@ -75,7 +75,7 @@ def test_distances_are_those_of_a_dense_cover_of_the_surface(
 @pytest.mark.parametrize("case", daily(1, CASES))
 def test_distances_change_by_no_more_than_the_way_between_two_points(case: str) -> None:
     truth = truth_of(case)
-    points = points_near(truth, 800, 0.3)
+    points = points_near(truth, 800, spread_mm=0.3)
     steps = np.random.default_rng(8).normal(0.0, 2.0, points.shape)
     change = np.abs(truth.signed_distance(points + steps) - truth.signed_distance(points))
     assert (change - np.linalg.norm(steps, axis=1)).max() < tolerances.PHANTOM_TRUTH_MM
@@ -84,7 +84,7 @@ def test_distances_change_by_no_more_than_the_way_between_two_points(case: str) 
 @pytest.mark.parametrize("case", daily(1, CASES))
 def test_gradient_of_the_distance_has_length_1_at_nearly_all_of_the_surface(case: str) -> None:
     truth = truth_of(case)
-    points = points_near(truth, 800, 0.3)
+    points = points_near(truth, 800, spread_mm=0.3)
     points = points[np.abs(truth.signed_distance(points)) < 0.3]
     step = 0.02  # mm
 
@@ -93,7 +93,7 @@ def test_gradient_of_the_distance_has_length_1_at_nearly_all_of_the_surface(case
     length = np.linalg.norm(np.stack(differences, axis=1) / (2.0 * step), axis=1)
     assert np.median(length) == pytest.approx(1.0, abs=2e-3)
     # less on the medial axis, over rims and in the joints, where the nearest points are several
-    assert (np.abs(length - 1.0) < 0.05).mean() > 0.9
+    assert (np.abs(length - 1.0) < 0.05).mean() > 0.98  # measured 0.993
 
 
 def sample_label_map(truth: PhantomTruth) -> tuple[np.ndarray, np.ndarray]:

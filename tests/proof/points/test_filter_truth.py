@@ -30,16 +30,16 @@ NEIGHBOURS_AND_FACTORS = ((16, 1.0), (16, 2.0), (32, 1.0))
 PRINTED_SIGN = 1.0
 
 
-def filter_points(points, k, factor, sign=-1.0):
+def filter_points(points, *, k, factor, sign=-1.0):
     indices, _ = find_neighbours(points, k)
     axes, _ = principal_axes(points, indices)
     return denoise_points(points, axes, indices, factor, sign)
 
 
 @functools.cache
-def filtered(shape, k, factor, sign=-1.0):
+def filtered(shape, *, k, factor, sign=-1.0):
     """The points of a shape with noise after the filter; kept, for it takes seconds."""
-    return filter_points(shape().points, k, factor, sign)
+    return filter_points(shape().points, k=k, factor=factor, sign=sign)
 
 
 @pytest.mark.release  # every day the device reaches these truths, and equals the twin
@@ -48,14 +48,14 @@ def test_noise_of_filtered_points_falls_to_its_known_rms(shape, region, rms_mm):
     truth = shape()
     before, *after = rms_mm
     assert truth.rms(truth.points, region) == pytest.approx(before, rel=FILTER_TRUTH_SHARE)
-    found = [truth.rms(filtered(shape, k, factor), region) for k, factor in NEIGHBOURS_AND_FACTORS]
+    found = [truth.rms(filtered(shape, k=k, factor=factor), region) for k, factor in NEIGHBOURS_AND_FACTORS]
     assert found == pytest.approx(after, rel=FILTER_TRUTH_SHARE)
 
 
 @pytest.mark.release
 @pytest.mark.parametrize(("shape", "region", "rms_mm"), PRINTED_SIGN_TRUTHS)
 def test_noise_of_points_filtered_with_the_printed_sign_rises_to_its_known_rms(shape, region, rms_mm):
-    found = shape().rms(filtered(shape, 16, 1.0, PRINTED_SIGN), region)
+    found = shape().rms(filtered(shape, k=16, factor=1.0, sign=PRINTED_SIGN), region)
     assert found == pytest.approx(rms_mm, rel=FILTER_TRUTH_SHARE)
 
 
@@ -65,30 +65,30 @@ def test_filter_lessens_noise_and_raises_it_with_the_printed_sign(shape, region)
     truth = shape()
     before = truth.rms(truth.points, region)
     # by TRUTHS and PRINTED_SIGN_TRUTHS 0.64 to 0.66 and 1.37 to 1.38 of what was before
-    assert truth.rms(filtered(shape, 16, 1.0), region) < 0.8 * before
-    assert truth.rms(filtered(shape, 16, 1.0, PRINTED_SIGN), region) > 1.2 * before
+    assert truth.rms(filtered(shape, k=16, factor=1.0), region) < 0.8 * before
+    assert truth.rms(filtered(shape, k=16, factor=1.0, sign=PRINTED_SIGN), region) > 1.2 * before
 
 
 @pytest.mark.release
 def test_filtered_ball_of_20_mm_shrinks_by_some_hundredths_of_a_mm_and_more_with_a_wider_range():
     truth = sphere()
-    shrunk, shrunk_by_wide = (truth.mean(filtered(sphere, 16, factor), "everywhere") for factor in (1.0, 2.0))
+    shrunk, shrunk_by_wide = (truth.mean(filtered(sphere, k=16, factor=factor), "everywhere") for factor in (1.0, 2.0))
     assert shrunk_by_wide < shrunk
     assert -0.015 < shrunk < -0.005  # mm
     assert -0.022 < shrunk_by_wide < -0.014
 
 
 def test_filtered_plane_without_noise_stays_in_place():
-    clean = plane(20.0).clean
-    assert np.abs(filter_points(clean, 16, 2.0) - clean).max() < FILTERED_PLANE_MM
+    clean = plane(size=20.0).clean
+    assert np.abs(filter_points(clean, k=16, factor=2.0) - clean).max() < FILTERED_PLANE_MM
 
 
 def test_points_in_another_order_are_filtered_to_the_same_places_in_that_order():
-    points = sphere(5.0).points
+    points = sphere(radius=5.0).points
     order = np.random.default_rng(0).permutation(len(points))
-    in_another_order = filter_points(points[order], 16, 2.0)
+    in_another_order = filter_points(points[order], k=16, factor=2.0)
     # sums of float64 in another order
-    assert np.allclose(in_another_order, filter_points(points, 16, 2.0)[order], atol=1e-9, rtol=0)
+    assert np.allclose(in_another_order, filter_points(points, k=16, factor=2.0)[order], atol=1e-9, rtol=0)
 
 
 @pytest.mark.parametrize(

@@ -47,7 +47,11 @@ def test_field_at_a_voxel_is_its_value_exactly(shape):
 
 def linear_volume(steps):
     field = lambda p: p @ SLOPE  # noqa: E731
-    volume = uneven_volume(field, (9, 8), (1.0, 0.4, 1.9, 1.0)) if steps == "uneven" else even_volume(field, steps, 9.0)
+    volume = (
+        uneven_volume(field, shape=(9, 8), gaps=(1.0, 0.4, 1.9, 1.0))
+        if steps == "uneven"
+        else even_volume(field, steps, extent=9.0)
+    )
     return volume.with_voxels(volume.voxels.astype(np.float32))
 
 
@@ -95,12 +99,12 @@ def compare_intervals(volume):
 
 @pytest.mark.parametrize("steps", STEPS)
 def test_interval_of_a_ray_reaches_half_a_voxel_beyond_the_outermost_voxels(steps):
-    among_voxels, in_interval = compare_intervals(even_volume(lambda p: p[:, 0], steps, 12.0))
+    among_voxels, in_interval = compare_intervals(even_volume(lambda p: p[:, 0], steps, extent=12.0))
     assert np.array_equal(in_interval, among_voxels)
 
 
 def test_interval_of_a_ray_through_uneven_slices_is_that_of_the_smallest_box_around_them():
-    among_voxels, in_interval = compare_intervals(uneven_volume(lambda p: p[:, 0], (20, 18), noise=0.0))
+    among_voxels, in_interval = compare_intervals(uneven_volume(lambda p: p[:, 0], shape=(20, 18), noise=0.0))
     assert in_interval[among_voxels].all()
     assert among_voxels.sum() > 0.3 * in_interval.sum()  # slices that lean fill about half of their box
 
@@ -108,7 +112,7 @@ def test_interval_of_a_ray_through_uneven_slices_is_that_of_the_smallest_box_aro
 @pytest.fixture(scope="module")
 def clipped_rays():
     """Enters, exits and planes of rays to, from and beside the kept quarter y > 0, z > 0 of a volume of 12.6 mm."""
-    volume = even_volume(lambda p: p[:, 0], "even", 12.0)  # 14 voxels of 0.9 mm
+    volume = even_volume(lambda p: p[:, 0], "even", extent=12.0)  # 14 voxels of 0.9 mm
     centre = centre_of(volume)
     clip = Clip.plane(centre, (0, 0, 1.0)) & Clip.plane(centre, (0, 1.0, 0))
     origins = centre + np.array([(0.0, -50.0, 3.0), (0.0, 50.0, 3.0), (0.0, -50.0, -3.0)])
@@ -160,16 +164,17 @@ def test_opacity_of_a_transfer_function_of_steps_is_that_of_the_side_of_the_step
 
 @pytest.mark.parametrize("direction", [None, (0.3, -2.0, 1.0)])
 def test_shade_of_a_colour_is_that_of_the_phong_formula_towards_the_viewer(direction):
-    lighting = Lighting(0.1, 0.6, 0.3, 9.0, direction)
+    ambient, diffuse, specular, power = 0.1, 0.6, 0.3, 9.0
+    lighting = Lighting(ambient=ambient, diffuse=diffuse, specular=specular, specular_power=power, direction=direction)
     rng = np.random.default_rng(8)
     gradients, directions = rng.normal(size=(2, 20, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    gradients[3] = 0.0
+    gradients[3] = 0.0  # nothing to be lit from a side
     colours = rng.uniform(size=(20, 3))
     shaded = shade(colours, gradients, directions, lighting)
     for n in range(20):
         if n == 3:
-            assert np.allclose(shaded[n], colours[n] * 0.7)
+            assert np.allclose(shaded[n], colours[n] * (ambient + diffuse))
             continue
         normal = gradients[n] / np.linalg.norm(gradients[n])
         light = -directions[n] if direction is None else np.array(direction) / np.linalg.norm(direction)
@@ -177,14 +182,15 @@ def test_shade_of_a_colour_is_that_of_the_phong_formula_towards_the_viewer(direc
         normal = normal if normal @ directions[n] < 0.0 else -normal
         lit = normal @ light > 0.0
         assert direction is not None or lit
-        expected = colours[n] * (0.1 + 0.6 * lit * (normal @ light)) + 0.3 * lit * abs(normal @ half_way) ** 9
+        shine = specular * lit * abs(normal @ half_way) ** power
+        expected = colours[n] * (ambient + diffuse * lit * (normal @ light)) + shine
         assert np.allclose(shaded[n], np.minimum(expected, 1.0))
 
 
 def test_colour_opacity_and_depths_of_a_ray_are_the_sums_over_its_samples_written_out():
     """Compositing, opacity over a part of a step, gradient opacity, shading and both depths, along a single ray."""
     rng = np.random.default_rng(9)
-    volume = even_volume(lambda p: rng.uniform(-200.0, 900.0, len(p)), "oblique", 11.0)
+    volume = even_volume(lambda p: rng.uniform(-200.0, 900.0, len(p)), "oblique", extent=11.0)
     gradient_nodes, gradient_opacities, unit_mm = [50.0, 600.0], [0.2, 1.0], 1.3
     function = TransferFunction(
         [(-100, 0.2, 0.4, 0.9, 0.0), (300, 1, 0.6, 0.3, 0.1), (800, 1, 1, 1, 0.5)],
@@ -226,7 +232,7 @@ def test_colour_opacity_and_depths_of_a_ray_are_the_sums_over_its_samples_writte
 
 
 def test_ray_shows_nothing_behind_the_sample_that_makes_it_opaque():
-    volume = even_volume(lambda p: np.where(p[:, 1] < 0.0, 100.0, 900.0), "even", 30.0)
+    volume = even_volume(lambda p: np.where(p[:, 1] < 0.0, 100.0, 900.0), "even", extent=30.0)
     red, green = (1, 0, 0), (0, 1, 0)  # red fog in front of an opaque green wall
     wall = TransferFunction([(0, *red, 0.4), (400, *red, 0.4), (400, *green, 1), (1000, *green, 1)])
 
@@ -239,7 +245,7 @@ def test_ray_shows_nothing_behind_the_sample_that_makes_it_opaque():
 
 def test_default_step_of_a_ray_is_half_the_smallest_spacing():
     smallest_spacing = np.linalg.norm(STEPS["anisotropic"], axis=0).min()  # 0.45 mm
-    volume = even_volume(lambda p: 50.0 * p[:, 1], "anisotropic", 12.0)
+    volume = even_volume(lambda p: 50.0 * p[:, 1], "anisotropic", extent=12.0)
     camera = look(volume, (0.3, 1.0, 0.2), 5.0)
     default, given = (
         cast_rays(volume, Projection("mean", ray_step=step), camera, (6, 6)).values
@@ -283,15 +289,16 @@ def test_jitter_of_a_pixel_does_not_depend_on_the_size_of_the_picture():
 
 def test_jitter_lies_within_each_segment_the_last_one_too():
     """Thin fog on a ramp along the ray, all samples at part u of their segments: the sum is known."""
-    volume = even_volume(lambda p: p[:, 1], "even", 20.0)
+    volume = even_volume(lambda p: p[:, 1], "even", extent=20.0)
     camera = look(volume, (0.0, 1.0, 0.0), 4.0)
     thin = TransferFunction([(-12, 1, 1, 1, 0.0), (12, 1, 1, 1, 0.001)])
     step, part = 1.7, jitter_pixels(8, 8)
     opacity = cast_rays(volume, VolumeLook(thin, jitter=True, ray_step=step), camera, (8, 8)).rgba[..., 3]
-    way, inner = 0.9 * volume.shape_ijk[1], 0.5 * 0.9 * (volume.shape_ijk[1] - 1)
-    starts = np.arange(0.0, way, step)
-    lengths = np.minimum(step, way - starts)
-    places = np.clip(starts + part[..., None] * lengths - 0.5 * way, -inner, inner)
+    voxel_mm = 0.9  # of an even volume
+    depth, inner = voxel_mm * volume.shape_ijk[1], 0.5 * voxel_mm * (volume.shape_ijk[1] - 1)
+    starts = np.arange(0.0, depth, step)
+    lengths = np.minimum(step, depth - starts)
+    places = np.clip(starts + part[..., None] * lengths - 0.5 * depth, -inner, inner)
     node = np.floor((places + 12.0) / 24.0 * (TABLE_NODES - 1) + 0.5) / (TABLE_NODES - 1)
     through = ((1.0 - 0.001 * node) ** lengths).prod(axis=-1)
     assert np.abs(opacity - (1.0 - through)).max() < 1e-7  # the table is float32: measured 2e-10

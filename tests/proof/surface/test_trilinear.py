@@ -116,7 +116,7 @@ def count_right_cells(seed: int, count: int) -> Counter:
 @pytest.mark.seconds
 @pytest.mark.untraced
 def test_150_random_cells_have_the_topology_of_their_trilinear_field():
-    found = count_right_cells(1, 150)
+    found = count_right_cells(seed=1, count=150)
     assert found["wrong"] == 0
     assert found["right"] >= 140  # of some the sampling is too coarse to say it
     assert found["tunnels"] >= 45  # a third of the cells have one
@@ -125,7 +125,7 @@ def test_150_random_cells_have_the_topology_of_their_trilinear_field():
 @pytest.mark.release
 @pytest.mark.slow
 def test_1000_random_cells_have_the_topology_of_their_trilinear_field():
-    found = count_right_cells(2, 1000)
+    found = count_right_cells(seed=2, count=1000)
     assert found["wrong"] == 0
     assert found["right"] >= 975  # of some the sampling is too coarse to say it
     assert found["tunnels"] >= 300  # a third of the cells have one
@@ -136,7 +136,7 @@ def test_scaled_heights_of_16_bit_voxels_are_exact(dtype, low, high):
     level = np.float32((low + high) // 2 - 0.5)
     voxels = np.concatenate([[low, high], np.random.default_rng(3).integers(low, high, 6)]).astype(dtype)
     heights = voxels.astype(np.float32) - level
-    sizes = scale_heights(heights, 18)
+    sizes = scale_heights(heights, bits=18)
     ratios = {
         Fraction(size) / Fraction(abs(2 * int(v) - int(2 * level))) for size, v in zip(sizes, voxels, strict=True)
     }
@@ -145,12 +145,12 @@ def test_scaled_heights_of_16_bit_voxels_are_exact(dtype, low, high):
 
 def test_scaled_heights_are_rounded_towards_zero():
     heights = [1.0, -0.5, 2.0**-29, 2.0**-31]
-    assert scale_heights(heights, 30) == [2**29, 2**28, 1, 0]
+    assert scale_heights(heights, bits=30) == [2**29, 2**28, 1, 0]
 
 
 def test_scaled_heights_of_the_smallest_number_keep_it_above_0():
     smallest_of_float32 = 1e-45
-    assert scale_heights([0.0, smallest_of_float32], 30) == [0, 1 << 6]
+    assert scale_heights([0.0, smallest_of_float32], bits=30) == [0, 1 << 6]
 
 
 def test_scaled_heights_from_the_smallest_to_the_largest_number_fit_into_their_bits():
@@ -198,7 +198,7 @@ def turn(heights, axes, flips):
 
 def test_decisions_do_not_depend_on_how_the_cell_is_turned():
     turns = list(product(permutations(range(3)), product((0, 1), repeat=3)))
-    for case, heights in draw_cells(6, 60):
+    for case, heights in draw_cells(seed=6, count=60):
         expected = expected_numbers(case, heights)
         for axes, flips in turns[:: 1 + case % 5]:
             turned = turn(heights, axes, flips)
@@ -218,11 +218,11 @@ def slope_at(heights, point):
     )
 
 
-@pytest.mark.parametrize(("cell_vertices", "within"), [(1, 0.95), (6, 1.0)])
-def test_vertices_inside_cells_lie_on_the_surface_in_the_cell(cell_vertices, within):
+@pytest.mark.parametrize("cell_vertices", [1, 6])
+def test_vertices_inside_cells_lie_on_the_surface_in_the_cell(cell_vertices):
     bound = tolerances.CENTRE_DISTANCE_STEP if cell_vertices == 1 else tolerances.WAIST_DISTANCE_STEP
-    margin, near = np.full(3, 1e-9), []
-    for case, heights in draw_with_vertices(7, 100, cell_vertices):
+    margin = np.full(3, 1e-9)
+    for case, heights in draw_with_vertices(seed=7, count=100, cell_vertices=cell_vertices):
         points, gradients = place_cell_vertices(find_row(case, heights), case, heights, margin)
         assert len(points) == cell_vertices
         assert ((points >= margin) & (points <= 1 - margin)).all()
@@ -230,8 +230,7 @@ def test_vertices_inside_cells_lie_on_the_surface_in_the_cell(cell_vertices, wit
             slope = slope_at(heights.astype(np.float64), point)
             cosine = gradient @ slope / (np.linalg.norm(gradient) * np.linalg.norm(slope))
             assert cosine > 0.99  # one direction, up to rounding: measured 1 - 2e-16
-            near.append(abs(field_at(heights.astype(np.float64), point)) / np.linalg.norm(slope) < bound)
-    assert np.mean(near) >= within
+            assert abs(field_at(heights.astype(np.float64), point)) / np.linalg.norm(slope) < bound
 
 
 def cell_points(case, heights, row) -> dict:
@@ -267,13 +266,13 @@ def count_crossings(triangles, points) -> int:
 @pytest.mark.release
 @pytest.mark.untraced
 def test_triangles_of_a_cell_do_not_cross_each_other():
-    rows = [(find_row(case, heights), case, heights) for case, heights in draw_cells(8, 150)]
+    rows = [(find_row(case, heights), case, heights) for case, heights in draw_cells(seed=8, count=150)]
     assert len(rows) == 150
     assert [count_crossings(row.triangles, cell_points(case, heights, row)) for row, case, heights in rows] == [0] * 150
 
 
 def test_triangles_of_a_cell_with_two_exchanged_vertices_are_found_to_cross():
-    ((case, heights),) = draw_with_vertices(9, 1, 6)
+    ((case, heights),) = draw_with_vertices(seed=9, count=1, cell_vertices=6)
     row = find_row(case, heights)
     points = cell_points(case, heights, row)
     first, last = CELL_VERTEX, CELL_VERTEX + 5  # of six inside the cell

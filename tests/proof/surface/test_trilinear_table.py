@@ -90,7 +90,8 @@ def test_states_of_ambiguous_faces_are_those_of_marching_cubes_33():
     assert found[3, 3, (3, 3, 3)] == 16  # 7.1
     assert found[3, 3, (3, 6)] == 48 + 16  # 7.2, 7.4
     assert found[3, 3, (9,)] == 48  # 7.3
-    assert found[4, 2, (4, 4)] == 12 and found[4, 2, (3, 5)] == 48  # 10.1, 12.1
+    assert found[4, 2, (4, 4)] == 12  # 10.1
+    assert found[4, 2, (3, 5)] == 48  # 12.1
     assert found[4, 2, (8,)] == 12 + 48  # 10.2, 12.2
     assert found[4, 6, (3, 3, 3, 3)] == 4  # 13.1
     assert found[4, 6, (3, 3, 6)] == 24 + 8  # 13.2, 13.5
@@ -164,7 +165,8 @@ def test_inside_corners_across_a_face_are_one_region_only_if_the_face_joins_them
     apart, joined = find_regions(diagonal, 0), find_regions(diagonal, 1)
     assert apart[FACES[0][0]] != apart[FACES[0][2]]
     assert joined[FACES[0][0]] == joined[FACES[0][2]]
-    assert len(set(apart)) == 3 and len(set(joined)) == 2
+    assert len(set(apart)) == 3
+    assert len(set(joined)) == 2
 
 
 def test_packed_trilinear_tables_have_every_row_of_the_table():
