@@ -166,7 +166,7 @@ def test_metal_at_3071_hu_is_warned_of_as_saturated_however_it_is_stored(tmp_pat
     ]
 
 
-def write_scan_with_24_voxels_at(folder, top, bits, signed):
+def write_scan_with_24_voxels_at(folder, top, *, bits, signed):
     hu = np.clip(make_scan(), -1024, top - 1)
     hu[:, 23:25, 23:25] = top
     return write_hu(folder, hu, Plan(shape=SHAPE, bits_stored=bits, signed=signed))
@@ -183,14 +183,14 @@ def write_scan_with_24_voxels_at(folder, top, bits, signed):
     ],
 )
 def test_voxels_at_the_largest_value_of_the_stored_bits_are_warned_of(tmp_path, bits, signed, top, words):
-    (warning,) = read_warnings(write_scan_with_24_voxels_at(tmp_path, top, bits, signed))
+    (warning,) = read_warnings(write_scan_with_24_voxels_at(tmp_path, top, bits=bits, signed=signed))
     assert warning.startswith(f"24 voxels are at {top} HU, the ")
     assert words in warning
 
 
 @pytest.mark.parametrize(("bits", "signed", "top"), [(16, True, 3000), (14, False, 3072)])
 def test_voxels_at_another_value_are_not_warned_of_as_saturated(tmp_path, bits, signed, top):
-    assert read_warnings(write_scan_with_24_voxels_at(tmp_path, top, bits, signed)) == []
+    assert read_warnings(write_scan_with_24_voxels_at(tmp_path, top, bits=bits, signed=signed)) == []
 
 
 def test_scan_whose_values_go_on_beyond_3071_hu_is_not_warned_of_as_saturated(tmp_path):

@@ -30,8 +30,9 @@ NAMES = ("hu_scale", "stored_sign")
 def judge_scale(hu, known=True, disc=None):
     """The gate ``hu_scale`` of values, `known` to be HU; `disc` is what was around a round field of view."""
     hu = np.asarray(hu, np.float32)
-    facts = PixelFacts(0.0, float(hu.min()), float(hu.max()), disc=disc)
-    return examine_voxels(hu, facts, (), known=known).gates[0]
+    facts = PixelFacts(padding_share=0.0, hu_min=float(hu.min()), hu_max=float(hu.max()), disc=disc)
+    (gate,) = (gate for gate in examine_voxels(hu, facts, (), known=known).gates if gate.name == "hu_scale")
+    return gate
 
 
 def peaks_in(gate):
@@ -79,7 +80,7 @@ def test_missing_intercept_of_values_not_known_to_be_hu_fails_from_a_tenth_of_so
 )
 @pytest.mark.parametrize("noise", [5.0, 12.0, 30.0])
 def test_body_on_another_scale_fails_with_the_hu_of_both_peaks_and_a_reason(slope, offset, air, tissue, reason, noise):
-    gate = judge_scale(make_body(noise) * slope + offset)
+    gate = judge_scale(make_body(noise=noise) * slope + offset)
     assert (gate.ok, gate.measured, gate.bound) == (False, 2, 0)  # two peaks in wrong places
     assert peaks_in(gate) == pytest.approx([air, tissue], abs=tolerances.PEAK_HU * max(slope, 1.0))
     assert_reason(gate, reason)
@@ -110,10 +111,11 @@ def test_scanner_that_is_off_by_100_hu_passes(shift):
 
 
 def foam(hu):
+    """What was air is 70 HU denser."""
     return np.where(hu < -500, hu + 70, hu)
 
 
-def with_texture(hu, low, high, spread=60.0):
+def with_texture(hu, *, low, high, spread=60.0):
     """Lung and bone are no flat materials."""
     rough = np.random.default_rng(9).normal(0.0, spread, hu.shape)
     return np.where((hu > low) & (hu < high), np.rint(hu + rough), hu)
@@ -129,17 +131,18 @@ UNUSUAL = {
     "water": make_layers(-1000, (40, 120), (38, 0)),
     "crop in bone": make_layers(250, (30, 900), (20, 1500), noise=40),
     "crop in fat": make_layers(-100, (20, 60)),
-    "lungs": with_texture(make_layers(-850, (6, 50)), -1000, -500),
-    "stiff lungs with contrast": with_texture(make_layers(-700, (20, 350), (10, 60)), -1000, -300),
-    "lungs of a mouse": with_texture(make_layers(-520, (20, 40), (8, 500)), -1000, -300),
-    "lungs and contrast alone": with_texture(make_layers(-800, (20, 330)), -1000, -300),
-    "brain and skull": with_texture(make_layers(900, (44, 1400), (42, 36)), 300, 2000, 250),
+    "lungs": with_texture(make_layers(-850, (6, 50)), low=-1000, high=-500),
+    "stiff lungs with contrast": with_texture(make_layers(-700, (20, 350), (10, 60)), low=-1000, high=-300),
+    "lungs of a mouse": with_texture(make_layers(-520, (20, 40), (8, 500)), low=-1000, high=-300),
+    "lungs and contrast alone": with_texture(make_layers(-800, (20, 330)), low=-1000, high=-300),
+    "brain and skull": with_texture(make_layers(900, (44, 1400), (42, 36)), low=300, high=2000, spread=250),
     "contrast": make_layers(-1000, (40, -100), (35, 60), (20, 400), (6, 1000)),
     "40 keV": make_layers(-1000, (40, -200), (35, 75), (16, 1100), (6, 2600)),
     "metal": make_layers(-1000, (40, -100), (35, 50), (10, 3071)),
     "wood around bone": make_layers(-550, (40, -1000), (20, 900)),
-    "loud": make_body(90.0),
+    "loud": make_body(noise=90.0),
 }
+"""`make_layers`: HU around all, and radius in pixels and HU of each layer from outside to inside."""
 UNUSUAL["cropped body"] = make_body()[:, 20:76, 20:76]
 UNUSUAL["masked to bone"] = np.where(make_body() > 150, make_body(), 0)
 UNUSUAL["padded in silence"] = np.where(radius_from() > 46, -2000, make_body())
@@ -358,7 +361,9 @@ def test_gates_of_a_grid_file_are_the_same_in_the_listing(tmp_path):
 @pytest.mark.parametrize("outside", [0.0, -1024.0], ids=["as the scanner wrote it", "as it was exported"])
 def test_cone_beam_in_a_grid_file_fails_on_its_own_scale_whatever_fills_the_outside(tmp_path, outside):
     path = tmp_path / "a.nii.gz"
-    Volume(make_jaw(0.8, 360.0, outside).astype(np.int16), np.diag([1.0, 1.0, 2.0, 1.0])).save(path)
+    Volume(make_jaw(slope=0.8, offset=360.0, padding=outside).astype(np.int16), np.diag([1.0, 1.0, 2.0, 1.0])).save(
+        path
+    )
     report = read_volume(path).report
     assert "air lies near -4" in value_gates_of(report)["hu_scale"]["text"]  # -1000 * 0.8 + 360 is -440
     assert (report["padding_share"] > 0.2) == (outside == 0.0)  # the corners around a circle of 46 in 48 pixels

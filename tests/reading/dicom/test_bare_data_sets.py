@@ -14,7 +14,7 @@ from clrecon.cli.main import main
 from clrecon.errors import NoDicomError, RefusedInputError
 from clrecon.reading import list_series, read_volume
 
-PLAN = Plan(shape=(3, 3, 4))
+PLAN = Plan(shape=(3, 3, 4))  # as `make_series` has it
 MARK_END = 132
 ENCODINGS = {
     "explicit": "explicit VR little endian",
@@ -24,6 +24,7 @@ ENCODINGS = {
 
 
 def meta_end(data: bytes) -> int:
+    """Behind the meta header, whose length stands in bytes 140 to 143."""
     return 144 + int.from_bytes(data[140:144], "little")
 
 
@@ -95,7 +96,8 @@ def test_one_bare_slice_refuses_the_series_unless_it_is_forced(tmp_path):
         read_volume(folder)
     volume = read_volume(folder, force=True)
     assert volume.voxels.shape[0] == 3
-    assert "explicit VR little endian taken (1 of 3 slices, at -397.50 mm)" in volume.report["warnings"][0]
+    place = f"at {PLAN.position(2)[2]:.2f} mm"
+    assert f"explicit VR little endian taken (1 of 3 slices, {place})" in volume.report["warnings"][0]
 
 
 @pytest.mark.fault_row(36)
@@ -153,22 +155,26 @@ def test_bare_slice_with_a_long_header_that_lacks_its_last_byte_is_refused_with_
 @pytest.mark.fault_row(44)
 @pytest.mark.parametrize(("start", "kind"), [(b"MZ\x90\0", "Windows"), (b"\x7fELF\x02", "Linux")])
 def test_program_in_the_preamble_is_warned_of(tmp_path, start, kind):
-    plan = write_series(tmp_path, Plan(name="{}".format))
+    plan = write_series(tmp_path, Plan(shape=(7, 5, 6), name="{}".format))
     for k in (0, 3):
         data = (tmp_path / f"{k}").read_bytes()
         (tmp_path / f"{k}").write_bytes(start + bytes(128 - len(start)) + data[128:])
     volume = read_volume(tmp_path)
     assert np.array_equal(volume.voxels, plan.hu())
-    said = f"the preamble starts a program ({kind}): neither run nor copied (2 of 7 slices, the first at -400.00 mm)"
-    assert volume.report["warnings"] == [said]
+    _, _, first_mm = plan.position(0)
+    assert volume.report["warnings"] == [
+        f"the preamble starts a program ({kind}): neither run nor copied"
+        f" (2 of 7 slices, the first at {first_mm:.2f} mm)"
+    ]
 
 
 @pytest.mark.fault_row(44)
 def test_tiff_picture_in_the_preamble_is_not_warned_of(tmp_path):
     """Files that are TIFF pictures too are a use that the standard names."""
-    plan = write_series(tmp_path, Plan(name="{}".format))
+    plan = write_series(tmp_path, Plan(shape=(7, 5, 6), name="{}".format))
     for k in range(7):
         data = (tmp_path / f"{k}").read_bytes()
         (tmp_path / f"{k}").write_bytes(b"II*\0" + bytes(124) + data[128:])
     volume = read_volume(tmp_path)
-    assert np.array_equal(volume.voxels, plan.hu()) and volume.report["warnings"] == []
+    assert np.array_equal(volume.voxels, plan.hu())
+    assert volume.report["warnings"] == []

@@ -43,11 +43,12 @@ def judge_completeness(folder, **options):
 
 
 def up(k):
+    """1 to 24."""
     return k + 1
 
 
 ODD = range(1, SLICES, 2)
-LOST = {
+LOST = {  # how slices are numbered, which are missing, how many the gate says, its words, and the plan
     "every second": (numbered(up), ODD, 11, "leaves out 11 of 1 to 23: step 2, and slices of 1 mm lie 2 mm apart"),
     "every second, downwards": (numbered(lambda k: 50 - k), ODD, 11, "leaves out 11 of 28 to 50: step 2"),
     "every second, overlapping": (numbered(up, thickness=1.5), ODD, 11, "slices of 1.5 mm lie 2 mm apart"),
@@ -83,7 +84,7 @@ def test_slices_missing_by_numbers_or_stated_counts_fail_the_gate_with_their_cou
     assert words in gate["text"]
 
 
-KEPT = {
+KEPT = {  # how slices are numbered, which are missing, and the plan
     "from 1": (numbered(up, STATED), ()),
     "from 0": (numbered(lambda k: k), ()),
     "downwards": (numbered(lambda k: 90 - k), ()),
@@ -219,9 +220,8 @@ def test_series_numbered_on_from_another_that_lacks_a_slice_fails_the_gate(tmp_p
 
 def test_file_with_many_frames_counts_as_one_stated_instance(tmp_path):
     write_enhanced(tmp_path / "a.dcm", change=lambda ds: setattr(ds, "NumberOfSeriesRelatedInstances", "3"))
-    assert (
-        "(NumberOfSeriesRelatedInstances says 3, there is 1): 2, none allowed" in judge_completeness(tmp_path)["text"]
-    )
+    text = judge_completeness(tmp_path)["text"]
+    assert "(NumberOfSeriesRelatedInstances says 3, there is 1): 2, none allowed" in text
 
 
 def test_certificate_holds_the_figures_of_the_numbering(tmp_path):

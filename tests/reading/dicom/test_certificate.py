@@ -89,9 +89,10 @@ def test_certificate_of_headers_alone_measures_no_gate_of_pixels_and_reads_none(
 
 @pytest.fixture(scope="module")
 def oblique_tilted(tmp_path_factory):
-    """The plan of 7 slices of 6 x 5 pixels, tilted by 12 degrees and oblique, and the report of their volume."""
+    """The plan of 7 slices 5 mm thick, tilted by 12 degrees and oblique, and the report of their volume."""
     folder = tmp_path_factory.mktemp("oblique")
-    plan = write_series(folder, Plan(tilt_deg=12, angles=(3, 4, -5)), set_values(PatientPosition="FFP"))
+    plan = Plan(shape=(7, 5, 6), pixel_spacing=(0.7, 0.5), gap=1.25, tilt_deg=12, angles=(3, 4, -5))
+    write_series(folder, plan, set_values(PatientPosition="FFP", SliceThickness=5.0))
     return plan, read_volume(folder).report
 
 
@@ -124,7 +125,8 @@ def test_certificate_of_an_even_series_misses_nothing_and_passes_its_gates(obliq
 
 def test_slices_thicker_than_their_gap_overlap(oblique_tilted):
     """Slices 5 mm thick every 1.25 mm share 3.75 mm, three times the gap."""
-    assert oblique_tilted[1]["thickness"] == {
+    _, report = oblique_tilted
+    assert report["thickness"] == {
         "min_mm": 5.0, "max_mm": 5.0, "median_mm": 5.0, "overlap_percent": pytest.approx(300.0),
         "overlap_mm": pytest.approx({"min": 3.75, "max": 3.75, "median": 3.75}),
     }  # fmt: skip
@@ -134,7 +136,7 @@ def test_slices_thinner_than_their_gap_have_a_negative_overlap(tmp_path):
     def thin(ds, k):
         ds.SliceThickness = 1.0 if k < 3 else 0.5
 
-    write_series(tmp_path, change=thin)  # every 1.25 mm
+    write_series(tmp_path, Plan(shape=(7, 5, 6), gap=1.25), thin)
     thickness = read_certificate(tmp_path)["thickness"]
     assert (thickness["min_mm"], thickness["max_mm"], thickness["median_mm"]) == (0.5, 1.0, 0.5)
     assert thickness["overlap_mm"] == pytest.approx({"min": 0.5 - 1.25, "max": 1.0 - 1.25, "median": -0.625})
@@ -175,7 +177,7 @@ def test_runs_of_equal_gaps_are_listed_with_their_count():
 
 
 def test_certificate_of_an_uneven_series_has_the_position_of_each_slice(tmp_path):
-    plan = write_series(tmp_path, Plan(offsets={3: 0.15}))
+    plan = write_series(tmp_path, Plan(shape=(7, 5, 6), offsets={3: 0.15}))
     certificate = read_certificate(tmp_path)
     assert certificate["uneven"]
     assert "grid_residual" in failed_gates(certificate)
@@ -190,8 +192,8 @@ ONE_GATE = {
     "hu_known, no slope": (Plan(), set_values(only=3, RescaleSlope=None)),
     "lossless": (Plan(), set_values(only=3, LossyImageCompression="01")),
     "measured_images": (Plan(), set_values(ImageType=["DERIVED", "SECONDARY", "MPR"])),
-    "stated_gap": (Plan(), set_values(SpacingBetweenSlices=0.625)),
-    "stated_gap, below zero": (Plan(), set_values(SpacingBetweenSlices=-1.25)),
+    "stated_gap": (Plan(gap=1.25), set_values(SpacingBetweenSlices=0.625)),
+    "stated_gap, below zero": (Plan(gap=1.25), set_values(SpacingBetweenSlices=-1.25)),
     "orientation_exact": (Plan(), set_raw("ImageOrientationPatient", SKEWED)),
 }
 
@@ -235,11 +237,11 @@ def test_series_with_a_cut_file_fails_the_gates_of_files_and_of_use(tmp_path):
 def test_padding_of_four_fifths_of_the_voxels_fails_its_gate_where_pixels_are_read(tmp_path):
     def pad(ds, k):
         ds.PixelPaddingValue = -2000
-        pixels = np.full(30, -2000, "i2")
+        pixels = np.full(5 * 6, -2000, "i2")
         pixels[:6] = 1000
         ds.PixelData = pixels.tobytes()
 
-    write_series(tmp_path, change=pad)
+    write_series(tmp_path, Plan(shape=(7, 5, 6)), pad)
     report = read_volume(tmp_path).report
     assert report["padding_share"] == pytest.approx(0.8)
     assert failed_gates(report) == {"padding_share"}
@@ -265,7 +267,7 @@ def test_certificate_holds_no_patient_no_date_and_no_folder(tmp_path):
     assert len(certificate["warnings"]) == 8  # five of tags above, the tilt, the corrupt file and the other series
     certificate.pop("problems")  # a refusal names files, on the terminal alone
     text = json.dumps(certificate)
-    assert "SECRET" not in text and "1901" not in text and str(tmp_path) not in text
+    assert [word for word in ("SECRET", "1901", str(tmp_path)) if word in text] == []
 
 
 @pytest.mark.parametrize(("name", "slices"), [("lumbar_4p25mm", 99), ("thoracic_0p8mm", 95)])
@@ -287,7 +289,7 @@ def test_real_series_with_three_gaps_has_them_as_runs_and_fails_the_gate_of_the_
 )
 def test_stack_without_sound_directions_fails_that_gate_in_strict_json(tmp_path, orientation):
     write_series(tmp_path, change=set_values(ImageOrientationPatient=orientation))
-    certificate = list_series(tmp_path, 1).certificate
+    certificate = list_series(tmp_path, series=1).certificate
     assert json.dumps(certificate, allow_nan=False)
     gates = {gate["name"]: gate for gate in certificate["gates"]}
     assert gates["orientation_exact"]["ok"] is False

@@ -15,11 +15,11 @@ from clrecon.errors import RefusedInputError
 from clrecon.reading import list_series, read_volume
 from clrecon.reading.dicom.headers.multiframe import PLACE_POINTERS
 
-PLAN = Plan(shape=(7, 5, 6))
+PLAN = Plan(shape=(7, 5, 6), gap=1.25)
 OBLIQUE = replace(PLAN, angles=(10.0, -5.0, 30.0))
 
 
-def make_frames(plan=PLAN, order=None, **elements):
+def make_frames(plan=PLAN, *, order=None, **elements):
     """All slices of a plan as frames in this order of places; the position is that of the first frame."""
     order = range(plan.shape[0]) if order is None else order
     ds = make_dataset(plan, order[0])
@@ -34,7 +34,7 @@ def make_frames(plan=PLAN, order=None, **elements):
     return ds
 
 
-def assert_right(volume, plan):
+def assert_voxels_and_places(volume, plan):
     assert np.array_equal(volume.voxels, plan.hu())
     corners = [(0, 0, 0), (5, 4, 6), (2, 3, 4)]
     assert volume.ijk_to_lps(corners) == pytest.approx(plan.truth(corners), abs=tolerances.AFFINE_MM)
@@ -50,7 +50,7 @@ def read_refusal(path):
 def test_frames_in_steps_of_the_stated_spacing_are_placed_with_a_warning(tmp_path, plan):
     save_dataset(make_frames(plan), tmp_path / "scan.dcm")
     volume = read_volume(tmp_path / "scan.dcm")
-    assert_right(volume, plan)
+    assert_voxels_and_places(volume, plan)
     assert volume.report["warnings"] == [
         "7 frames in one classic CT image: they run from feet to head, along the normal of rows and columns in steps "
         "of SpacingBetweenSlices, 1.25 mm; no element says that they do not run the other way, and then the volume is "
@@ -68,7 +68,7 @@ def test_frames_of_one_file_are_counted_as_slices_and_pass_all_gates(tmp_path):
 def test_frames_of_a_spacing_below_zero_run_against_the_normal(tmp_path):
     save_dataset(make_frames(order=range(6, -1, -1), SpacingBetweenSlices=-1.25), tmp_path / "scan")
     volume = read_volume(tmp_path)
-    assert_right(volume, PLAN)
+    assert_voxels_and_places(volume, PLAN)
     assert "they run from head to feet, along the normal" in volume.report["warnings"][0]
     assert [gate["name"] for gate in volume.report["gates"] if gate["ok"] is False] == []
 
@@ -78,9 +78,11 @@ def test_frames_of_a_spacing_below_zero_run_against_the_normal(tmp_path):
 def test_frames_run_the_way_that_their_offsets_say(tmp_path, plan, down):
     order = range(6, -1, -1) if down else range(7)
     offsets = [(k - order[0]) * plan.gap for k in order]
-    save_dataset(make_frames(plan, order, GridFrameOffsetVector=offsets, SpacingBetweenSlices=None), tmp_path / "scan")
+    save_dataset(
+        make_frames(plan, order=order, GridFrameOffsetVector=offsets, SpacingBetweenSlices=None), tmp_path / "scan"
+    )
     volume = read_volume(tmp_path)
-    assert_right(volume, plan)
+    assert_voxels_and_places(volume, plan)
     way = "head to feet" if down else "feet to head"
     assert volume.report["warnings"] == [
         f"7 frames in one classic CT image: they run from {way}, as GridFrameOffsetVector says (all slices)"
@@ -92,7 +94,7 @@ def test_frames_lie_at_the_z_that_their_offsets_are(tmp_path, orientation):
     plan = replace(PLAN, angles=orientation)
     z = [plan.position(k)[2] for k in range(7)]
     save_dataset(make_frames(plan, GridFrameOffsetVector=z), tmp_path / "scan")
-    assert_right(read_volume(tmp_path), plan)
+    assert_voxels_and_places(read_volume(tmp_path), plan)
 
 
 def test_frames_of_uneven_offsets_lie_at_their_own_places(tmp_path):
@@ -101,15 +103,15 @@ def test_frames_of_uneven_offsets_lie_at_their_own_places(tmp_path):
     save_dataset(make_frames(plan, GridFrameOffsetVector=offsets), tmp_path / "scan")
     volume = read_volume(tmp_path)
     assert volume.report["uneven"]
-    assert_right(volume, plan)
+    assert_voxels_and_places(volume, plan)
 
 
 def test_frames_in_no_order_lie_at_their_offsets_with_a_warning(tmp_path):
     order = [3, 0, 6, 1, 5, 2, 4]
     offsets = [(k - 3) * PLAN.gap for k in order]
-    save_dataset(make_frames(PLAN, order, GridFrameOffsetVector=offsets), tmp_path / "scan")
+    save_dataset(make_frames(PLAN, order=order, GridFrameOffsetVector=offsets), tmp_path / "scan")
     volume = read_volume(tmp_path)
-    assert_right(volume, PLAN)
+    assert_voxels_and_places(volume, PLAN)
     assert "they are in no order, as GridFrameOffsetVector says" in volume.report["warnings"][0]
 
 
@@ -118,13 +120,13 @@ def test_compressed_frames_of_a_classic_image_are_read(tmp_path):
     ds.file_meta.TransferSyntaxUID = PLAN.syntax
     ds.compress(RLELossless, generate_instance_uid=False)
     save_dataset(ds, tmp_path / "scan")
-    assert_right(read_volume(tmp_path), PLAN)
+    assert_voxels_and_places(read_volume(tmp_path), PLAN)
 
 
 @pytest.mark.parametrize("pointer", sorted(PLACE_POINTERS))
 def test_frames_that_are_slices_by_their_pointer_are_read(tmp_path, pointer):
     save_dataset(make_frames(FrameIncrementPointer=Tag(pointer)), tmp_path / "scan")
-    assert_right(read_volume(tmp_path), PLAN)
+    assert_voxels_and_places(read_volume(tmp_path), PLAN)
 
 
 @pytest.mark.parametrize(
@@ -156,7 +158,8 @@ def test_frames_that_are_slices_by_their_pointer_are_read(tmp_path, pointer):
 def test_frames_whose_places_are_not_known_are_refused_with_what_is_missing(tmp_path, elements, words):
     save_dataset(make_frames(**elements), tmp_path / "scan")
     said = read_refusal(tmp_path / "scan")
-    assert words in said and "name the folder" not in said
+    assert words in said
+    assert "name the folder" not in said
 
 
 def test_one_slice_of_a_series_is_refused_with_the_advice_to_name_the_folder(tmp_path):

@@ -32,37 +32,37 @@ ONE_GATE = daily(1, ["intercept off by 324", "slope and intercept of another sca
 
 
 @pytest.fixture(params=ONE_GATE)
-def damaged(request, tmp_path):
+def damaged_folder(request, tmp_path):
     """A damaged series, the name of the gate that it fails, and words of its warning."""
     row = VALUES[request.param]
     (gate,) = row.gates
     return str(write_damaged(tmp_path / "ct", row)), gate, row.words
 
 
-def test_command_info_shows_the_gate_that_damaged_values_fail(damaged, printed):
-    folder, gate, _ = damaged
+def test_command_info_shows_the_gate_that_damaged_values_fail(damaged_folder, printed):
+    folder, gate, _ = damaged_folder
     assert main(["info", folder, "--pixels"]) == 0
     printed().assert_output("FAILED", gate)
 
 
-def test_command_info_refuses_damaged_values_with_strict(damaged, printed):
-    folder, gate, _ = damaged
+def test_command_info_refuses_damaged_values_with_strict(damaged_folder, printed):
+    folder, gate, _ = damaged_folder
     assert main(["info", folder, "--pixels", "--strict"]) == RefusedInputError.exit_code
     printed().assert_error(gate)
 
 
 def test_command_mesh_warns_of_damaged_values_and_writes_the_failed_gate_into_the_mesh(
-    damaged, tmp_path, device, capsys
+    damaged_folder, tmp_path, device, capsys
 ):
-    folder, gate, words = damaged
+    folder, gate, words = damaged_folder
     output = tmp_path / "a.ply"
     assert main(["mesh", folder, "-o", str(output), "--hu", "300", "--device", str(device.index)]) == 0
     assert words in capsys.readouterr().err
     assert f"comment CERTIFICATE gate_failed {gate}: ".encode() in output.read_bytes()
 
 
-def test_command_mesh_fails_for_damaged_values_with_strict(damaged, tmp_path, device, printed):
-    folder, gate, _ = damaged
+def test_command_mesh_fails_for_damaged_values_with_strict(damaged_folder, tmp_path, device, printed):
+    folder, gate, _ = damaged_folder
     mesh = ["mesh", folder, "-o", str(tmp_path / "a.ply"), "--hu", "300", "--device", str(device.index)]
     assert main([*mesh, "--strict"]) == SCAN_GATE_FAILED
     printed().assert_error("gate", gate, "failed")

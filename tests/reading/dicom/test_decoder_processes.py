@@ -26,6 +26,7 @@ LINUX = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="how pro
 
 
 def make_pool(*names, **limits):
+    """A pool with the decoder that copies, and others of tests/support/hostile_decoders.py."""
     return DecoderPool([f"hostile_decoders:{name}" for name in ("copy", *names)], PIXELS.nbytes, **limits)
 
 
@@ -117,8 +118,8 @@ def test_decoder_that_takes_too_much_memory_is_stopped_and_the_next_frame_is_dec
 
 
 def test_limits_of_time_and_memory_grow_with_the_bytes_of_a_frame():
-    small, large = DecoderPool([], 512 * 512 * 2), DecoderPool([], 8192 * 8192 * 2)  # 0.5 and 128 MiB
-    assert 60 <= small.seconds < 61  # a minute, and about one second a MiB
+    small, large = (DecoderPool([], frame_bytes=mebibytes << 20) for mebibytes in (1, 128))
+    assert 60 < small.seconds <= 61  # a minute, and a second a MiB
     assert 180 < large.seconds < 200
     assert 2**28 <= small.memory_bytes < 2**29  # 256 MiB, and some times the frame
     assert 2**32 <= large.memory_bytes < 2**33
@@ -132,7 +133,7 @@ def test_what_a_decoder_prints_is_dropped(capfd):
 
 def test_decoder_that_cannot_be_imported_is_refused_with_its_module():
     with (
-        DecoderPool(["no_such_module:decode"], 8) as pool,
+        DecoderPool(["no_such_module:decode"], frame_bytes=8) as pool,
         refused(DecoderError, "ModuleNotFoundError", "no_such_module"),
     ):
         pool.decode(b"", "no_such_module:decode", np.zeros((1, 1), np.int16))
@@ -155,7 +156,7 @@ def test_processes_inherit_no_handles_and_leave_none(tmp_path):
         os.set_inheritable(file.fileno(), True)
         with make_pool("list_handles") as pool:
             handles = decode(pool, "list_handles")
-            # Standard input, output, errors, replies, the lifeline, and the folder that is being listed.
+            # Output, errors, replies, the lifeline, and the folder that is being listed; 0 is standard input.
             assert np.count_nonzero(handles) == 5
             pids = pool.process_ids()
     assert not any(Path(f"/proc/{pid}").exists() for pid in pids)  # no zombie either
@@ -179,7 +180,8 @@ def test_threads_have_at_most_a_decoder_process_each_and_all_of_them_end():
         for thread in threads:
             thread.join()
         pids = pool.process_ids()
-    assert results == [True] * (thread_count * frames) and 1 <= len(pids) <= thread_count
+    assert results == [True] * (thread_count * frames)
+    assert 1 <= len(pids) <= thread_count
     assert not any(Path(f"/proc/{pid}").exists() for pid in pids)
 
 
@@ -250,7 +252,7 @@ def test_decoder_process_imports_no_module_from_the_current_folder(tmp_path, mon
         monkeypatch.setattr(sys, "path", [entry, *sys.path])
     with make_pool() as pool:
         assert np.array_equal(decode(pool), PIXELS)
-    with DecoderPool(["own_decoder:decode"], 8) as pool, refused(DecoderError, "module"):
+    with DecoderPool(["own_decoder:decode"], frame_bytes=8) as pool, refused(DecoderError, "module"):
         pool.decode(b"", "own_decoder:decode", np.zeros((1, 1), np.int16))
     assert not (tmp_path / "ran").exists()
 
@@ -262,7 +264,8 @@ def test_decoder_process_ends_with_a_parent_that_is_killed(name):
     code = SCRIPT.format(path=[entry for entry in sys.path if entry], name=name)
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as parent:
         pids = [int(word) for word in parent.stdout.readline().split()]
-        assert len(pids) == 1 and is_alive(pids[0])
+        (pid,) = pids
+        assert is_alive(pid)
         parent.kill()
         assert wait_for_end(pids)
 

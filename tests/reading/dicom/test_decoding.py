@@ -36,7 +36,7 @@ from compressed_frames import (
 from dicom_series import Plan, make_dataset, save_dataset
 from pydicom.data import get_testdata_file
 from pydicom.encaps import encapsulate, encapsulate_extended
-from pydicom.uid import ExplicitVRBigEndian
+from pydicom.uid import ExplicitVRBigEndian, ExplicitVRLittleEndian
 from refusals import refused
 from variants import daily
 
@@ -72,14 +72,15 @@ def test_every_decoder_gives_the_pixels_that_were_encoded(decoder):
     pytest.importorskip(decoder.split()[0])
     out = np.zeros((ROWS, COLUMNS), np.uint16)
     with DecoderPool([decoder], out.nbytes) as pool:
-        pool.decode(ENCODERS[name][1](IMAGES[1]), decoder, out)
+        _, encode = ENCODERS[name]
+        pool.decode(encode(IMAGES[1]), decoder, out)
     assert np.array_equal(out, IMAGES[1])
 
 
 def test_coding_whose_decoder_is_not_installed_is_refused(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with refused(RefusedInputError, "decoder", "installed"):
-        codecs.choose_decoder(JPEG + "80")
+        codecs.choose_decoder(JPEG + "80")  # JPEG-LS
 
 
 CODINGS = pytest.mark.parametrize("name", ["JPEG lossless 6", "JPEG-LS", "JPEG 2000", "RLE"])
@@ -97,15 +98,17 @@ def test_signed_pixels_are_decoded(tmp_path, name):
 def encode_8_bits(name):
     """Pixels of 8 bits, and their codestream."""
     pixels = (IMAGES[0] % 256).astype(np.uint8)
-    return pixels, encode_lossless(pixels, 6, 8) if name.startswith("JPEG lossless") else ENCODERS[name][1](pixels)
+    if name == "JPEG lossless 6":
+        return pixels, encode_lossless(pixels, predictor=6, bits=8)
+    _, encode = ENCODERS[name]
+    return pixels, encode(pixels)
 
 
 @CODINGS
 def test_pixels_of_8_bits_are_decoded(tmp_path, name):
     expected, data = encode_8_bits(name)
-    (pixels,) = place(
-        tmp_path, encapsulate([data]) + END, ENCODERS[name][0], bits_allocated=8, bits_stored=8, high_bit=7
-    )
+    syntax, _ = ENCODERS[name]
+    (pixels,) = place(tmp_path, encapsulate([data]) + END, syntax, bits_allocated=8, bits_stored=8, high_bit=7)
     assert pixels.dtype == np.uint8
     assert np.array_equal(pixels, expected)
 
@@ -113,13 +116,14 @@ def test_pixels_of_8_bits_are_decoded(tmp_path, name):
 @pytest.mark.parametrize("name", ["JPEG lossless 6", "JPEG-LS", "JPEG 2000"])
 def test_codestream_of_8_bits_is_decoded_into_16_allocated_ones(tmp_path, name):
     expected, data = encode_8_bits(name)
-    (pixels,) = place(tmp_path, encapsulate([data]) + END, ENCODERS[name][0], bits_stored=8, high_bit=7)
+    syntax, _ = ENCODERS[name]
+    (pixels,) = place(tmp_path, encapsulate([data]) + END, syntax, bits_stored=8, high_bit=7)
     assert pixels.dtype == np.uint16
     assert np.array_equal(pixels, expected)
 
 
 TWELVE_SIGNED_BITS = {
-    "JPEG lossless": (JPEG + "70", lambda image: encode_lossless(image, 1, 12)),
+    "JPEG lossless": (JPEG + "70", lambda image: encode_lossless(image, predictor=1, bits=12)),
     "JPEG 2000": (JPEG + "90", lambda image: encode_jpeg_2000(image, bitspersample=12)),
 }
 """Codestreams of 12 bits without a sign, in pixels whose header says 16 bits with one."""
@@ -162,7 +166,7 @@ def test_compressed_frames_are_found_with_and_without_offsets_in_one_or_several_
         pytest.skip("an RLE frame is one fragment")
     syntax, encode = ENCODERS[name]
     data = encapsulate([encode(image) for image in IMAGES], fragments_per_frame=pieces, has_bot=table) + END
-    for pixels, image in zip(place(tmp_path, data, syntax, 4), IMAGES, strict=True):
+    for pixels, image in zip(place(tmp_path, data, syntax, frames=4), IMAGES, strict=True):
         assert np.array_equal(pixels, image)
 
 
@@ -231,7 +235,7 @@ class CountingFile(io.BytesIO):
 def test_frames_are_found_by_the_heads_of_their_items_alone():
     data = encapsulate([bytes(1000)] * 500, has_bot=False) + END
     file = CountingFile(data)
-    frames = transfer_syntaxes.find_frames(file, 0, len(data), 500, RLE)
+    frames = transfer_syntaxes.find_frames(file, start=0, file_bytes=len(data), frames=500, transfer_syntax=RLE)
     assert file.count == (1 + 500 + 1) * 8  # table, fragments and end mark
     assert transfer_syntaxes.read_pieces(file, frames[499]) == bytes(1000)
     assert file.count == (1 + 500 + 1) * 8 + 1000
@@ -242,7 +246,7 @@ def test_frames_of_a_file_are_found_once_for_all_of_them(monkeypatch, tmp_path):
     path.write_bytes(encapsulate([encode_rle(image) for image in IMAGES]) + END)
     calls = []
     monkeypatch.setattr(stored, "find_frames", lambda *a: calls.append(a) or transfer_syntaxes.find_frames(*a))
-    assert np.array_equal(load(make_headers(path, RLE, 4)), IMAGES)
+    assert np.array_equal(load(make_headers(path, RLE, frames=4)), IMAGES)
     assert len(calls) == 1
 
 
@@ -250,7 +254,7 @@ def test_frames_of_an_uncompressed_file_are_read(tmp_path):
     pixels = IMAGES.tobytes()
     path = tmp_path / "plain"
     path.write_bytes(bytes(20) + pixels)
-    headers = make_headers(path, "1.2.840.10008.1.2.1", 4)
+    headers = make_headers(path, ExplicitVRLittleEndian, frames=4)
     headers = [dataclasses.replace(header, pixel_offset=20, pixel_length=len(pixels)) for header in headers]
     assert np.array_equal(load(headers), IMAGES)
 
@@ -262,7 +266,7 @@ def test_frames_of_a_deflated_file_are_read_and_it_is_inflated_once(tmp_path, mo
     path.write_bytes(b"meta" + deflater.compress(bytes(20) + pixels) + deflater.flush())
     headers = [
         dataclasses.replace(header, pixel_offset=20, pixel_length=len(pixels), inflate_from=4)
-        for header in make_headers(path, "1.2.840.10008.1.2.1", 4)
+        for header in make_headers(path, ExplicitVRLittleEndian, frames=4)
     ]
     calls = []
     inflate = stored.inflate

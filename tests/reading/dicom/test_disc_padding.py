@@ -13,6 +13,7 @@ from clrecon.reading.common.padding import fill_disc_padding
 
 
 def read_signed(folder, hu):
+    """A volume of HU that were stored as they are."""
     return read_volume(write_values(folder, hu, Plan(shape=SHAPE, intercept=0)))
 
 
@@ -24,7 +25,7 @@ def read_signed(folder, hu):
 def test_cone_beam_on_another_scale_fails_that_gate_alone_with_and_without_padding(
     tmp_path, slope, offset, padding, noise
 ):
-    report = read_signed(tmp_path, make_jaw(slope, offset, padding, noise)).report
+    report = read_signed(tmp_path, make_jaw(slope=slope, offset=offset, padding=padding, noise=noise)).report
     assert {gate["name"] for gate in report["gates"] if gate["ok"] is False} == {"hu_scale"}
     assert (report["padding_share"] > 0.2) == (padding is not None)  # around a circle of 46 pixels in a square of 96
 
@@ -34,7 +35,7 @@ OUTSIDE_OF_DISC = radius_from() > 46
 
 @pytest.mark.parametrize("value", [0.0, 300.0, -500.0])
 def test_one_value_outside_of_a_disc_is_replaced_by_the_hu_of_air(tmp_path, value):
-    hu = make_jaw(1, 0, value)
+    hu = make_jaw(slope=1, offset=0, padding=value)
     volume = read_signed(tmp_path, hu)
     assert volume.report["padding_hu"] == pytest.approx(-1000, abs=tolerances.DISC_AIR_HU)
     assert (volume.voxels[:, OUTSIDE_OF_DISC] == volume.report["padding_hu"]).all()
@@ -43,7 +44,7 @@ def test_one_value_outside_of_a_disc_is_replaced_by_the_hu_of_air(tmp_path, valu
 
 @pytest.mark.parametrize("value", [0.0, 300.0, -500.0])
 def test_one_value_outside_of_a_disc_is_warned_of_with_its_share(tmp_path, value):
-    report = read_signed(tmp_path, make_jaw(1, 0, value)).report
+    report = read_signed(tmp_path, make_jaw(slope=1, offset=0, padding=value)).report
     share = OUTSIDE_OF_DISC.mean()
     assert report["padding_share"] == pytest.approx(share, abs=tolerances.DISC_SHARE)
     assert report["warnings"] == [
@@ -75,8 +76,13 @@ def test_scan_without_a_disc_whose_outside_is_above_air_is_left_as_it_is(hu):
 def jaw_on_own_scale(request, tmp_path):
     """Slope and offset of a jaw on its own scale, its volume, and the iso value of the same jaw in HU."""
     slope, offset = request.param
-    in_hu = choose_iso_value(read_signed(tmp_path / "hu", make_jaw(1, 0, None, noise=15.0)))
-    return slope, offset, read_signed(tmp_path / "own", make_jaw(slope, offset, 0.0, noise=15.0)), in_hu
+    in_hu = choose_iso_value(read_signed(tmp_path / "hu", make_jaw(slope=1, offset=0, padding=None, noise=15.0)))
+    return (
+        slope,
+        offset,
+        read_signed(tmp_path / "own", make_jaw(slope=slope, offset=offset, padding=0.0, noise=15.0)),
+        in_hu,
+    )
 
 
 def test_iso_value_of_a_scan_on_its_own_scale_is_that_in_hu_on_that_scale(jaw_on_own_scale):
@@ -92,8 +98,10 @@ def test_iso_value_of_a_scan_on_its_own_scale_is_that_in_hu_on_that_scale(jaw_on
 
 @pytest.mark.parametrize(("slope", "offset"), [(1, 200), (1, 400), (1, 800), (0.6, 400), (1, 324)])
 def test_iso_value_of_a_scan_on_its_own_scale_without_padding_is_that_in_hu_on_that_scale(tmp_path, slope, offset):
-    in_hu = choose_iso_value(read_signed(tmp_path / "hu", make_jaw(1, 0, None, noise=15.0)))
-    chosen = choose_iso_value(read_signed(tmp_path / "own", make_jaw(slope, offset, None, noise=15.0)))
+    in_hu = choose_iso_value(read_signed(tmp_path / "hu", make_jaw(slope=1, offset=0, padding=None, noise=15.0)))
+    chosen = choose_iso_value(
+        read_signed(tmp_path / "own", make_jaw(slope=slope, offset=offset, padding=None, noise=15.0))
+    )
     expected = slope * in_hu.iso_value + offset
     assert chosen.iso_value == pytest.approx(expected, abs=tolerances.OWN_SCALE_HU * slope)
 

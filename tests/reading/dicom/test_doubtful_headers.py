@@ -13,6 +13,9 @@ from refusals import refused
 from clrecon.errors import RefusedInputError
 from clrecon.reading import list_series, read_volume
 
+SEVEN_SLICES = Plan(shape=(7, 5, 6), gap=1.25)
+AT_SLICE_2 = f"(1 of 7 slices, at {SEVEN_SLICES.position(2)[2]:.2f} mm)"
+
 
 @pytest.mark.parametrize(
     ("change", "shift", "words"),
@@ -39,8 +42,8 @@ def test_series_without_slope_or_intercept_is_read_with_a_warning(tmp_path, chan
     ],
 )
 def test_slice_whose_pixels_are_coded_unlike_those_of_the_others_is_warned_of(tmp_path, keyword, value, usual):
-    write_series(tmp_path, change=set_values(2, **{keyword: value}))
-    words = f"{keyword} is not {usual} as in the other slices: the HU may be wrong (1 of 7 slices, at -397.50 mm)"
+    write_series(tmp_path, SEVEN_SLICES, set_values(only=2, **{keyword: value}))
+    words = f"{keyword} is not {usual} as in the other slices: the HU may be wrong {AT_SLICE_2}"
     assert read_volume(tmp_path).report["warnings"] == [words]
     assert words in list_series(tmp_path).series[0].warnings
 
@@ -53,10 +56,10 @@ def test_slice_whose_declared_padding_is_not_that_of_the_others_is_warned_of(tmp
         if padding is not None:
             ds.PixelPaddingValue = padding
 
-    write_series(tmp_path, change=change)
+    write_series(tmp_path, SEVEN_SLICES, change)
     words = (
         "PixelPaddingValue is not as in the other slices: measured voxels may count as padding, or padding as HU"
-        " (1 of 7 slices, at -397.50 mm)"
+        f" {AT_SLICE_2}"
     )
     assert read_volume(tmp_path).report["warnings"] == ([words] if value != usual else [])
 
@@ -140,10 +143,11 @@ def test_metal_at_3071_hu_is_warned_of_from_a_few_voxels_on(tmp_path, count, top
         stored[:count] = top + 1024
         ds.PixelData = stored.tobytes()
 
-    write_series(tmp_path, change=saturate)
+    write_series(tmp_path, SEVEN_SLICES, saturate)
     report = read_volume(tmp_path).report
-    assert report["hu_range"][1] == top
-    warning = "21 voxels are at 3071 HU, the ceiling of 12 bits: metal is saturated, its surface displaced"
+    _, highest = report["hu_range"]
+    assert highest == top
+    warning = f"{7 * 3} voxels are at 3071 HU, the ceiling of 12 bits: metal is saturated, its surface displaced"
     assert report["warnings"] == ([warning] if is_warned_of else [])
 
 

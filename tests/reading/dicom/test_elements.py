@@ -134,9 +134,9 @@ def encode(tag: tuple[int, int], vr: bytes, value: bytes, implicit: bool, length
 def wrap(body: bytes, implicit: bool) -> bytes:
     """A whole file around the elements of `body`."""
     syntax = b"1.2.840.10008.1.2\0" if implicit else b"1.2.840.10008.1.2.1\0"
-    meta = encode((2, 0x0002), b"UI", b"1.2.840.10008.5.1.4.1.1.2\0", False)
-    meta += encode((2, 0x0010), b"UI", syntax, False)
-    return bytes(128) + b"DICM" + meta + body + encode((0x7FE0, 0x0010), b"OW", bytes(8), implicit)
+    meta = encode((2, 0x0002), b"UI", b"1.2.840.10008.5.1.4.1.1.2\0", implicit=False)
+    meta += encode((2, 0x0010), b"UI", syntax, implicit=False)
+    return bytes(128) + b"DICM" + meta + body + encode((0x7FE0, 0x0010), b"OW", bytes(8), implicit=implicit)
 
 
 TAGS = [
@@ -153,7 +153,7 @@ def make_element(chance: random.Random, implicit: bool, depth: int = 3) -> bytes
         return struct.pack("<HHL", 0xFFFE, chance.choice([0xE000, 0xE00D, 0xE0DD]), 0)
     if depth == 0 or chance.randrange(3):
         wrong = chance.choice([None] * 12 + [0, 2, 0xFFFFFFFF])
-        return encode(tag, vr, chance.randbytes(2 * chance.randrange(7)), implicit, wrong)
+        return encode(tag, vr, chance.randbytes(2 * chance.randrange(7)), implicit=implicit, length=wrong)
     items = b""
     for _ in range(chance.randrange(3)):
         content = b"".join(make_element(chance, implicit, depth - 1) for _ in range(chance.randrange(4)))
@@ -166,9 +166,9 @@ def make_element(chance: random.Random, implicit: bool, depth: int = 3) -> bytes
     tag = chance.choice([(0x0008, 0x1110), (0x0040, 0x0275), (0x0009, 0x1010), (0x6000, 0x3000), tag])
     vr = chance.choice([b"SQ", b"SQ", b"SQ", vr])
     if chance.randrange(2):
-        return encode(tag, vr, items, implicit)
+        return encode(tag, vr, items, implicit=implicit)
     end = struct.pack("<HHL", 0xFFFE, 0xE0DD, 0)
-    return encode(tag, vr, items + chance.choice([end] * 6 + [b""]), implicit, 0xFFFFFFFF)
+    return encode(tag, vr, items + chance.choice([end] * 6 + [b""]), implicit=implicit, length=0xFFFFFFFF)
 
 
 @pytest.mark.release
@@ -177,7 +177,7 @@ def make_element(chance: random.Random, implicit: bool, depth: int = 3) -> bytes
 def test_random_headers_are_parsed_alike_by_both_parsers_or_left_by_the_plain_one(implicit: bool) -> None:
     chance = random.Random(176)
     for _ in range(300):
-        whole = wrap(b"".join(make_element(chance, implicit) for _ in range(chance.randrange(7))), implicit)
+        whole = wrap(b"".join(make_element(chance, implicit) for _ in range(chance.randrange(7))), implicit=implicit)
         assert_parsed_alike(whole, len(whole))
 
 
@@ -190,35 +190,37 @@ def item(content: bytes, defined: bool = True) -> bytes:
 def nest(levels: int, implicit: bool = False) -> bytes:
     content = b""
     for _ in range(levels):
-        content = encode((0x0008, 0x1110), b"SQ", item(content, False) + SEQUENCE_END, implicit, 0xFFFFFFFF)
+        content = encode(
+            (0x0008, 0x1110), b"SQ", item(content, defined=False) + SEQUENCE_END, implicit=implicit, length=0xFFFFFFFF
+        )
     return content
 
 
 SEQUENCE_END = struct.pack("<HHL", 0xFFFE, 0xE0DD, 0)
 ITEM_END = struct.pack("<HHL", 0xFFFE, 0xE00D, 0)
-NAME = encode((0x0008, 0x0060), b"CS", b"CT", True)
-NESTED_CHARSET = encode((0x0008, 0x0005), b"CS", b"x\0y ", False)
+NAME = encode((0x0008, 0x0060), b"CS", b"CT", implicit=True)
+NESTED_CHARSET = encode((0x0008, 0x0005), b"CS", b"x\0y ", implicit=False)
 
 
 def sequence(items: bytes, implicit: bool, tag: tuple[int, int] = (0x0008, 0x1110)) -> bytes:
-    return encode(tag, b"SQ", items + SEQUENCE_END, implicit, 0xFFFFFFFF)
+    return encode(tag, b"SQ", items + SEQUENCE_END, implicit=implicit, length=0xFFFFFFFF)
 
 
 DOUBTFUL = {
-    "a character set inside, which pydicom refuses": (False, sequence(item(NESTED_CHARSET), False)),
-    "an item that ends before its length": (True, sequence(item(ITEM_END + NAME), True)),
-    "an element over the end of its item": (True, sequence(item(NAME)[:-2] + NAME[8:] + b"..", True)),
-    "no item in a sequence": (True, sequence(NAME, True)),
+    "a character set inside, which pydicom refuses": (False, sequence(item(NESTED_CHARSET), implicit=False)),
+    "an item that ends before its length": (True, sequence(item(ITEM_END + NAME), implicit=True)),
+    "an element over the end of its item": (True, sequence(item(NAME)[:-2] + NAME[8:] + b"..", implicit=True)),
+    "no item in a sequence": (True, sequence(NAME, implicit=True)),
     "a delimiter between elements": (True, ITEM_END),
     "nested deeper than anybody writes": (False, nest(plain.DEEPEST + 1)),
     "bytes of undefined length": (
         False,
-        encode((0x0009, 0x1010), b"OB", item(b"1234") + SEQUENCE_END, False, 0xFFFFFFFF),
+        encode((0x0009, 0x1010), b"OB", item(b"1234") + SEQUENCE_END, implicit=False, length=0xFFFFFFFF),
     ),
-    "an unknown element of undefined length": (True, sequence(item(NAME), True, (0x6000, 0x3000))),
-    "an unknown representation": (False, encode((0x0009, 0x1010), b"ZZ", b"1234", False)),
+    "an unknown element of undefined length": (True, sequence(item(NAME), implicit=True, tag=(0x6000, 0x3000))),
+    "an unknown representation": (False, encode((0x0009, 0x1010), b"ZZ", b"1234", implicit=False)),
     "a character set that pydicom looks up": (False, NESTED_CHARSET),
-    "explicit under implicit": (True, encode((0x0008, 0x0060), b"CS", b"CT", False)),
+    "explicit under implicit": (True, encode((0x0008, 0x0060), b"CS", b"CT", implicit=False)),
     "implicit under explicit": (False, NAME),
 }
 
@@ -226,13 +228,13 @@ DOUBTFUL = {
 @pytest.mark.parametrize("case", DOUBTFUL)
 def test_doubtful_headers_are_left_to_the_careful_parser(case: str) -> None:
     implicit, doubtful = DOUBTFUL[case]
-    assert plain.parse_plainly(wrap(b"", implicit), 500, WANTED_TAGS) is not None
-    assert plain.parse_plainly(wrap(doubtful, implicit), 500, WANTED_TAGS) is None
+    assert plain.parse_plainly(wrap(b"", implicit=implicit), 500, WANTED_TAGS) is not None
+    assert plain.parse_plainly(wrap(doubtful, implicit=implicit), 500, WANTED_TAGS) is None
 
 
 def test_plain_parser_reads_the_deepest_nesting_it_allows() -> None:
-    assert assert_parsed_alike(wrap(nest(plain.DEEPEST), False), 5000)
-    assert assert_parsed_alike(wrap(nest(plain.DEEPEST, implicit=True), True), 5000)
+    assert assert_parsed_alike(wrap(nest(plain.DEEPEST), implicit=False), 5000)
+    assert assert_parsed_alike(wrap(nest(plain.DEEPEST, implicit=True), implicit=True), 5000)
 
 
 @pytest.mark.parametrize("syntax", [plain.IMPLICIT_LITTLE, "1.2.840.10008.1.2.1"])
@@ -248,7 +250,7 @@ def test_sequences_of_undefined_length_are_read_by_the_plain_parser(tmp_path: Pa
         ds[tag].is_undefined_length = True
     save_dataset(ds, tmp_path / "file")
     data = (tmp_path / "file").read_bytes()
-    assert data.count(b"\xff\xff\xff\xff") == 4
+    assert data.count(b"\xff\xff\xff\xff") == 4  # of two sequences and the first item of each
     assert assert_parsed_alike(data, len(data))
 
 

@@ -77,6 +77,7 @@ def test_object_lies_in_its_place_with_any_axes_reversed(tmp_path, flips_kji):
 
 
 def write_dicomdir(path, file_ids):
+    """A DICOMDIR with an image record for each of these ReferencedFileIDs."""
     ds = Dataset()
     ds.file_meta = FileMetaDataset()
     ds.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
@@ -129,8 +130,9 @@ def test_series_among_links_pipes_and_sockets_is_read_without_opening_them(folde
 @pytest.mark.fault_row(43)
 @pytest.mark.parametrize("name", ["a", "pipe.dcm", "s"], ids=["link in a circle", "pipe", "socket"])
 def test_link_in_a_circle_pipe_and_socket_are_refused_by_themselves(folder_of_traps, name):
+    _, folder = folder_of_traps
     with refused(NoDicomError, "regular"):
-        read_volume(folder_of_traps[1] / name)
+        read_volume(folder / name)
 
 
 @pytest.mark.fault_row(43)

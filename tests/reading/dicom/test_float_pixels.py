@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from dicom_series import Plan, set_values, write_series
@@ -11,6 +13,9 @@ from stored_pixels import set_pixels
 
 from clrecon.errors import RefusedInputError
 from clrecon.reading import read_volume
+
+SEVEN_SLICES = Plan(shape=(7, 5, 6))
+"""Its stored values run from 900 on, by 1 a pixel and by 40 a slice."""
 
 
 def set_floats(make, width=32, **values):
@@ -34,7 +39,7 @@ def keep(array, k):
 @pytest.mark.parametrize("width", [32, 64])
 @pytest.mark.parametrize("syntax", [ExplicitVRLittleEndian, ImplicitVRLittleEndian, DeflatedExplicitVRLittleEndian])
 def test_float_pixels_are_read_as_hu_in_float32(tmp_path, width, syntax):
-    plan = write_series(tmp_path, Plan(syntax=syntax), set_floats(keep, width))
+    plan = write_series(tmp_path, Plan(syntax=syntax), set_floats(keep, width=width))
     volume = read_volume(tmp_path)
     assert volume.voxels.dtype == np.float32
     assert np.array_equal(volume.voxels, (plan.hu() + 1024) * 0.5 - 1474)
@@ -56,7 +61,7 @@ def test_declared_float_padding_is_read_as_air(tmp_path, width, value, limit):
     values = {f"{prefix}FloatPixelPaddingValue": value}
     if limit is not None:
         values[f"{prefix}FloatPixelPaddingRangeLimit"] = limit
-    plan = write_series(tmp_path, change=set_floats(pad, width, **values))
+    plan = write_series(tmp_path, SEVEN_SLICES, set_floats(pad, width=width, **values))
 
     volume = read_volume(tmp_path)
 
@@ -70,28 +75,29 @@ def test_declared_float_padding_is_read_as_air(tmp_path, width, value, limit):
 
 @pytest.mark.fault_row(32)
 @pytest.mark.parametrize(
-    ("value", "words"),
+    ("value", "facts"),
     [
-        (np.nan, "1 NaN and 0 infinite values of 30"),
-        (-np.inf, "0 NaN and 1 infinite values of 30"),
-        (3e38, "values from -964 to 3e\\+38"),
+        (np.nan, ("NaN", 1, "infinite", 0, 30)),
+        (-np.inf, ("NaN", 0, "infinite", 1, 30)),
+        (3e38, ((900 + 3 * 40) * 0.5 - 1474, 3e38)),  # the lowest and the highest value of the slice
     ],
+    ids=["NaN", "infinite", "huge"],
 )
-def test_slice_with_a_nan_infinite_or_huge_voxel_is_refused_by_its_name(tmp_path, value, words):
+def test_slice_with_a_nan_infinite_or_huge_voxel_is_refused_by_its_name_and_values(tmp_path, value, facts):
     def spoil(array, k):
         if k == 3:
             array[2, 2] = value
         return array
 
-    write_series(tmp_path, change=set_floats(spoil))
-    with refused(RefusedInputError, "slice003", "Float", "Pixel", "Data"):
+    write_series(tmp_path, SEVEN_SLICES, set_floats(spoil))
+    with refused(RefusedInputError, "slice003", "Float", "Pixel", "Data", *facts):
         read_volume(tmp_path)
 
 
 @pytest.mark.fault_row(32)
 def test_volume_of_nan_is_refused(tmp_path):
-    write_series(tmp_path, change=set_floats(lambda array, k: array * np.nan))
-    with refused(RefusedInputError, "NaN", 30, 0):
+    write_series(tmp_path, SEVEN_SLICES, set_floats(lambda array, k: array * np.nan))
+    with refused(RefusedInputError, "NaN", 5 * 6, 0):
         read_volume(tmp_path)
 
 
@@ -99,14 +105,14 @@ def test_volume_of_nan_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (set_pixels(lambda array, k: array * 0 + 7), "all 210 voxels are -1017 HU: the volume is constant"),
-        (set_pixels(lambda array, k: array * 0 - 2000, PixelPaddingValue=-2000), "all 210 voxels are padding"),
-        (set_floats(lambda array, k: array * 0 + 3.5), "all 210 voxels are 3.5 HU"),
+        (set_pixels(lambda array, k: array * 0 + 7), f"voxels are {7 - 1024} HU: the volume is constant"),
+        (set_pixels(lambda array, k: array * 0 - 2000, PixelPaddingValue=-2000), "voxels are padding"),
+        (set_floats(lambda array, k: array * 0 + 3.5), "voxels are 3.5 HU"),
     ],
 )
 def test_volume_of_one_value_or_of_padding_alone_is_refused(tmp_path, change, words):
-    write_series(tmp_path, change=change)
-    with pytest.raises(RefusedInputError, match=words):
+    write_series(tmp_path, replace(SEVEN_SLICES, intercept=-1024), change)
+    with pytest.raises(RefusedInputError, match=f"all {7 * 5 * 6} {words}"):
         read_volume(tmp_path)
 
 
@@ -116,10 +122,10 @@ def test_volume_of_one_value_or_of_padding_alone_is_refused(tmp_path, change, wo
         ({"RescaleSlope": 2}, ("RescaleSlope", 2.0)),
         ({"RescaleIntercept": -1024}, ("RescaleIntercept", -1024.0)),
         ({"BitsAllocated": 16}, ("BitsAllocated", 16, 32)),
-        ({"Rows": 6}, ("truncated", 144, 120)),
+        ({"Rows": 6}, ("truncated", 6 * 6 * 4, 5 * 6 * 4)),
     ],
 )
 def test_float_pixels_with_a_rescale_or_another_size_are_refused(tmp_path, values, facts):
-    write_series(tmp_path, change=set_floats(keep, **values))
+    write_series(tmp_path, SEVEN_SLICES, set_floats(keep, **values))
     with refused(RefusedInputError, "slice000.dcm", *facts):
         read_volume(tmp_path)

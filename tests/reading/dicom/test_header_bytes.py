@@ -31,7 +31,7 @@ from clrecon.reading.dicom.series.series import PROBLEMS_SHOWN, Series
 
 pytestmark = pytest.mark.unit
 
-EXPLICIT = _make_encoding(False, True)
+EXPLICIT = _make_encoding(implicit=False, little=True)
 SHOWN = [f"bad {number}" for number in range(PROBLEMS_SHOWN)]
 
 
@@ -89,7 +89,12 @@ CAPITALS = pytest.mark.parametrize("vr", [b"AA", b"DA", b"AZ", b"ZZ", b"LO"])
 
 @CAPITALS
 def test_head_with_two_capital_letters_has_them_as_value_representation(vr):
-    assert _Walk(element(0x00100010, vr), 0).read_head(0, 8, EXPLICIT) == (0x00100010, vr, 0, 8)
+    assert _Walk(element(0x00100010, vr), items_limit=0).read_head(position=0, end=8, encoding=EXPLICIT) == (
+        0x00100010,
+        vr,
+        0,
+        8,
+    )
 
 
 @CAPITALS
@@ -104,7 +109,7 @@ NO_CAPITALS = pytest.mark.parametrize("vr", [b"@A", b"A@", b"[A", b"A[", b"aa"])
 @NO_CAPITALS
 def test_head_without_two_capital_letters_is_refused_in_explicit_vr(vr):
     with refused(ValueProblem, "VR"):
-        _Walk(element(0x00100010, vr), 0).read_head(0, 8, EXPLICIT)
+        _Walk(element(0x00100010, vr), items_limit=0).read_head(position=0, end=8, encoding=EXPLICIT)
 
 
 @NO_CAPITALS
@@ -114,20 +119,21 @@ def test_data_set_whose_first_head_has_no_two_capital_letters_is_implicit(vr):
 
 @pytest.mark.parametrize("start", [b"", element(0x7FE10010)], ids=["nothing", "another element"])
 def test_start_that_is_no_head_of_pixel_data_is_left_open(start):
-    assert read_pixel_head(start, 500, False, True) == (None, -1, 0, "")
+    assert read_pixel_head(start, 500, implicit=False, little=True) == (None, -1, 0, "")
 
 
 def test_head_of_pixel_data_in_explicit_vr_has_tag_place_length_and_vr():
     head = long_element(0x7FE00010, b"OW", bytes(4))[:12]
-    assert read_pixel_head(head, 500, False, True) == (0x7FE00010, 500 + len(head), 4, "OW")
+    assert read_pixel_head(head, 500, implicit=False, little=True) == (0x7FE00010, 500 + len(head), 4, "OW")
 
 
 def test_head_of_pixel_data_of_undefined_length_in_implicit_vr_has_length_minus_1():
     head = struct.pack("<HHL", 0x7FE0, 0x0010, 0xFFFFFFFF)
-    assert read_pixel_head(head + bytes(4), 500, True, True) == (0x7FE00010, 500 + len(head), -1, "")
+    assert read_pixel_head(head + bytes(4), 500, implicit=True, little=True) == (0x7FE00010, 500 + len(head), -1, "")
 
 
 def fragments(count: int) -> io.BytesIO:
+    """So many empty items, and the end mark."""
     items = struct.pack("<HHL", 0xFFFE, 0xE000, 0) * count
     return io.BytesIO(items + struct.pack("<HHL", 0xFFFE, 0xE0DD, 0))
 
@@ -135,14 +141,16 @@ def fragments(count: int) -> io.BytesIO:
 def test_frame_of_1999_fragments_is_found():
     """The first item is the table of offsets; a frame in RLE may have several fragments."""
     file = fragments(1 + 1999)
-    frames = transfer_syntaxes.find_frames(file, 0, len(file.getvalue()), 1, RLE)
+    frames = transfer_syntaxes.find_frames(
+        file, start=0, file_bytes=len(file.getvalue()), frames=1, transfer_syntax=RLE
+    )
     assert [len(pieces) for pieces in frames] == [1999]
 
 
 def test_frame_of_2000_fragments_is_refused():
     file = fragments(1 + 2000)
     with refused(RefusedInputError, 2000):
-        transfer_syntaxes.find_frames(file, 0, len(file.getvalue()), 1, RLE)
+        transfer_syntaxes.find_frames(file, start=0, file_bytes=len(file.getvalue()), frames=1, transfer_syntax=RLE)
 
 
 FRAGMENTS = [(100, 2), (110, 2), (120, 2), (130, 2)]
@@ -189,11 +197,11 @@ def test_zeros_behind_an_even_number_of_pixel_bytes_are_warned_of_from_the_first
 @pytest.mark.parametrize(("rows", "columns"), [(0, 5), (5, 0), (0, 0)])
 def test_image_without_rows_or_columns_is_refused(rows, columns):
     with refused(ValueProblem, rows, columns):
-        _check_matrix(1, "MONOCHROME2", rows, columns)
+        _check_matrix(1, "MONOCHROME2", rows=rows, columns=columns)
 
 
 def test_image_of_one_pixel_is_accepted():
-    assert _check_matrix(1, "MONOCHROME2", 1, 1) is None
+    assert _check_matrix(1, "MONOCHROME2", rows=1, columns=1) is None
 
 
 def values_of(**raw: tuple[int, bytes, str]) -> Values:
@@ -209,12 +217,12 @@ def values_of(**raw: tuple[int, bytes, str]) -> Values:
     ("text", "frames"), [(b"", 1), (b"0 ", 1), (b"1 ", 1), (b"2 ", 2)], ids=["empty", "0", "1", "2"]
 )
 def test_number_of_frames_is_at_least_one(text, frames):
-    assert count_frames(values_of(frames=(0x00280008, text, "IS")), "1.2") == frames
+    assert count_frames(values_of(frames=(0x00280008, text, "IS")), sop_class="1.2") == frames
 
 
 def test_number_of_frames_beyond_65536_is_refused():
     with refused(ValueProblem, 65537, "image"):
-        count_frames(values_of(frames=(0x00280008, b"65537", "IS")), "1.2")
+        count_frames(values_of(frames=(0x00280008, b"65537", "IS")), sop_class="1.2")
 
 
 @pytest.mark.parametrize(("raw", "vr"), [(b"\1\2", "US"), (b"\1\2\0\0", "UL")], ids=["US", "UL"])
@@ -236,7 +244,10 @@ def test_unsigned_number_of_another_length_is_refused(raw, vr):
     ("raw", "vr"), [(b"\x30\xf8", "SS"), (b"\x30\xf8", "US"), (b"\x30\xf8\xff\xff", "UL"), (b"\x30\xf8", "OW")]
 )
 def test_padding_value_is_read_as_signed_from_any_binary_form(raw, vr):
-    assert values_of(padding=(0x00280120, raw, vr)).padding(16, 16, True) == (-2000, -2000)  # lowest and highest
+    assert values_of(padding=(0x00280120, raw, vr)).padding(bits_allocated=16, bits_stored=16, signed=True) == (
+        -2000,
+        -2000,
+    )  # lowest and highest
 
 
 @pytest.mark.parametrize(
@@ -246,7 +257,7 @@ def test_padding_value_is_read_as_signed_from_any_binary_form(raw, vr):
 )
 def test_padding_value_that_is_text_or_of_another_length_is_refused(raw, vr):
     with refused(ValueProblem, "number"):
-        values_of(padding=(0x00280120, raw, vr)).padding(16, 16, True)
+        values_of(padding=(0x00280120, raw, vr)).padding(bits_allocated=16, bits_stored=16, signed=True)
 
 
 def test_elements_with_the_bits_of_overlays_are_those_of_the_sixteen_even_groups():
@@ -296,7 +307,7 @@ def test_private_element_of_undefined_length_is_a_sequence_where_an_item_follows
     assert not plain._is_sequence(bytes(4), 0, private)
 
 
-def box(kind: bytes, value: bytes, form: str) -> bytes:
+def box(kind: bytes, value: bytes, *, form: str) -> bytes:
     if form == "long":
         return struct.pack(">L4sQ", 1, kind, 16 + len(value)) + value
     return struct.pack(">L4s", 0 if form == "to the end" else 8 + len(value), kind) + value
@@ -306,9 +317,9 @@ def box(kind: bytes, value: bytes, form: str) -> bytes:
 @pytest.mark.parametrize("before", ["short", "long"])
 def test_codestream_in_a_jp2_file_is_found(form, before):
     codestream = b"\xff\x4f\xff\x51 codes"
-    start = stored._JP2_START + box(b"ftyp", b"jp2 12", before)
-    after = b"" if form == "to the end" else box(b"uuid", b"more", "short")
-    assert stored._unwrap_jp2(start + box(b"jp2c", codestream, form) + after) == codestream
+    start = stored._JP2_START + box(b"ftyp", b"jp2 12", form=before)
+    after = b"" if form == "to the end" else box(b"uuid", b"more", form="short")
+    assert stored._unwrap_jp2(start + box(b"jp2c", codestream, form=form) + after) == codestream
 
 
 @pytest.mark.parametrize(
@@ -317,7 +328,7 @@ def test_codestream_in_a_jp2_file_is_found(form, before):
     ids=["nothing", "half a head", "length below 8"],
 )
 def test_jp2_file_without_a_codestream_is_refused(rest):
-    start = stored._JP2_START + box(b"ftyp", b"jp2 12", "short")
+    start = stored._JP2_START + box(b"ftyp", b"jp2 12", form="short")
     with refused(RefusedInputError, "JP2"):
         stored._unwrap_jp2(start + rest)
 
@@ -368,12 +379,14 @@ def worker_that_answers(*replies: tuple[int, int]) -> Any:
     return made
 
 
-ASK = decoder_pool._Worker.ask
+def ask_for_pixels(worker: Any, out: np.ndarray) -> tuple[int, str]:
+    """Status and text of the answer; the pixels go into `out`."""
+    return decoder_pool._Worker.ask(worker, request={}, data=b"", out=out, seconds=1.0)
 
 
 def test_pixels_of_a_decoder_are_written_into_the_array_that_was_given():
     out = np.zeros(4, np.uint16)
-    assert ASK(worker_that_answers((READY, 0), (DONE, 8)), {}, b"", out, 1.0) == (DONE, "")
+    assert ask_for_pixels(worker_that_answers((READY, 0), (DONE, 8)), out) == (DONE, "")
     assert out.view(np.uint8).tolist() == list(range(8))
 
 
@@ -381,14 +394,14 @@ def test_pixels_of_a_decoder_are_written_into_the_array_that_was_given():
 def test_decoder_that_answers_with_another_number_of_bytes_is_given_up_and_nothing_written(count):
     out = np.zeros(4, np.uint16)
     with pytest.raises(decoder_pool._WorkerEndedError):
-        ASK(worker_that_answers((READY, 0), (DONE, count)), {}, b"", out, 1.0)
+        ask_for_pixels(worker_that_answers((READY, 0), (DONE, count)), out)
     assert not out.any()
 
 
 @pytest.mark.parametrize("status", [FAILED, NO_MEMORY], ids=["failed", "no memory"])
 def test_decoder_that_fails_answers_with_its_text(status):
     worker = worker_that_answers((READY, 0), (status, 5))
-    assert ASK(worker, {}, b"", np.zeros(4, np.uint16), 1.0) == (status, "5 letters")
+    assert ask_for_pixels(worker, np.zeros(4, np.uint16)) == (status, "5 letters")
 
 
 @pytest.mark.parametrize(
@@ -399,7 +412,7 @@ def test_decoder_that_fails_answers_with_its_text(status):
 def test_worker_that_ends_before_it_is_ready_keeps_its_text_only_without_a_decoder(status, why):
     worker = worker_that_answers((status, 5))
     with pytest.raises(decoder_pool._WorkerEndedError):
-        ASK(worker, {}, b"", np.zeros(4, np.uint16), 1.0)
+        ask_for_pixels(worker, np.zeros(4, np.uint16))
     assert (worker.why, worker.ready) == (why, False)
 
 
@@ -441,12 +454,12 @@ def test_other_stacks_are_warned_of_and_larger_faulty_ones_as_not_usable(kind, c
     chosen: Any = SimpleNamespace(count=5, number=1, key="a")
     taken = choice.Choice(chosen, "by lot")
     assert choice.describe_left([chosen, other], taken) == said
-    assert choice.describe_left([chosen], taken) == choice.describe_left([chosen, other], taken, "2") == []
+    assert choice.describe_left([chosen], taken) == choice.describe_left([chosen, other], taken, wanted="2") == []
 
 
 @pytest.mark.parametrize(
     ("kind", "modality", "key", "told"),
-    [
+    [  # the chosen series has the key "a"
         ("other", "unknown", "b", True),
         ("other", "other", "b", True),
         ("other", "SR", "b", False),
