@@ -20,7 +20,7 @@ pytestmark = pytest.mark.unit
 def test_arrays_of_the_right_type_are_not_copied():
     vertices = np.zeros((3, 3), np.float32)
     triangles = np.array([[0, 1, 2]], np.uint32)
-    mesh = Mesh(vertices, triangles, vertices)
+    mesh = Mesh(vertices, triangles, normals=vertices)
     assert mesh.vertices is vertices
     assert mesh.triangles is triangles
     assert mesh.normals is vertices
@@ -87,7 +87,7 @@ def test_normals_that_are_not_finite_are_refused_on_the_way_to_pyvista():
     normals = np.eye(3)
     normals[1, 2] = np.nan
     with refused(UsageError, 1, "normal"):
-        Mesh(np.eye(3), [[0, 1, 2]], normals).to_pyvista()
+        Mesh(np.eye(3), [[0, 1, 2]], normals=normals).to_pyvista()
 
 
 SPHERE_CENTRE = (3, 0, -7)
@@ -95,8 +95,8 @@ SPHERE_CENTRE = (3, 0, -7)
 
 def sphere_with_normals(report: dict | None = None) -> Mesh:
     """A sphere of 10 mm about (3, 0, -7)."""
-    vertices, triangles = samples.sphere(SPHERE_CENTRE, 10.0)
-    return Mesh(vertices, triangles, (vertices - SPHERE_CENTRE) / 10.0, report)
+    vertices, triangles = samples.sphere(SPHERE_CENTRE, radius=10.0)
+    return Mesh(vertices, triangles, normals=(vertices - SPHERE_CENTRE) / 10.0, report=report)
 
 
 def test_vertices_and_normals_in_ras_have_x_and_y_negated():
@@ -115,13 +115,14 @@ def test_coordinates_in_ras_hold_no_negative_zero():
 
 def test_a_mesh_in_ras_keeps_its_volume_and_its_sign():
     mesh = sphere_with_normals()
-    in_ras = Mesh(mesh.in_space("ras")[0], mesh.triangles)
-    assert in_ras.volume == pytest.approx(mesh.volume)
+    vertices, _ = mesh.in_space("ras")
+    assert Mesh(vertices, mesh.triangles).volume == pytest.approx(mesh.volume)
 
 
 def test_vertices_in_lps_are_those_of_the_mesh_without_a_copy():
     mesh = sphere_with_normals()
-    assert mesh.in_space("lps")[0] is mesh.vertices
+    vertices, _ = mesh.in_space("lps")
+    assert vertices is mesh.vertices
 
 
 def test_a_frame_that_is_neither_lps_nor_ras_is_refused():
@@ -133,7 +134,7 @@ def test_a_frame_that_is_neither_lps_nor_ras_is_refused():
 def torus_with_normals():
     """A closed torus; each vertex has the normal (0, 0, 1)."""
     vertices, triangles = samples.torus()
-    return Mesh(vertices, triangles, np.tile(np.float32([0, 0, 1]), (len(vertices), 1)))
+    return Mesh(vertices, triangles, normals=np.tile(np.float32([0, 0, 1]), (len(vertices), 1)))
 
 
 def test_pyvista_shares_the_memory_of_vertices_and_normals(torus_with_normals):
@@ -171,7 +172,7 @@ def test_repr_of_a_mesh_says_vertices_triangles_and_frame():
 
 
 def test_contents_of_a_file_have_name_and_colour_of_a_part():
-    content = Mesh(*samples.box(), None, {"part_name": "001", "color": [1, 0.5, 0]}).describe("LPS")
+    content = Mesh(*samples.box(), report={"part_name": "001", "color": [1, 0.5, 0]}).describe("LPS")
     assert (content.name, content.color) == ("001", (1.0, 0.5, 0.0))
 
 
@@ -256,7 +257,7 @@ def test_a_transformed_mesh_without_normals_has_none():
 )
 def test_a_matrix_that_is_no_invertible_affine_is_refused(matrix, words):
     with refused(UsageError, *words):
-        Mesh(*samples.sphere((0, 0, 0))).transformed(matrix)
+        Mesh(*samples.sphere()).transformed(matrix)
 
 
 @pytest.fixture
@@ -316,7 +317,7 @@ def test_values_that_are_not_one_number_a_vertex_under_a_plain_name_are_not_writ
 def two_boxes():
     """A box at the origin with HU, and one at x = 5 with mm; their reports differ in voxel and device."""
     one = Mesh(*samples.box(), report={"voxel_mm": 0.5, "iso_value_hu": 226, "device": "a"})
-    other = Mesh(*samples.box((5.0, 0.0, 0.0)), report={"voxel_mm": 2.0, "iso_value_hu": 226, "device": "b"})
+    other = Mesh(*samples.box(low=(5.0, 0.0, 0.0)), report={"voxel_mm": 2.0, "iso_value_hu": 226, "device": "b"})
     one.values["HU"] = np.arange(8.0)
     other.values["mm"] = np.ones(8)
     return one, other
@@ -356,8 +357,8 @@ def test_merging_leaves_the_first_mesh_as_it_is(two_boxes):
 
 def test_normals_are_merged_only_where_every_mesh_has_them(two_boxes):
     plain, _ = two_boxes
-    with_normals = Mesh(plain.vertices, plain.triangles, np.tile([0.0, 0.0, 1.0], (8, 1)))
-    assert with_normals.merge(with_normals).normals.shape == (16, 3)
+    with_normals = Mesh(plain.vertices, plain.triangles, normals=np.tile([0.0, 0.0, 1.0], (8, 1)))
+    assert with_normals.merge(with_normals).normals.shape == (8 + 8, 3)
     assert with_normals.merge(plain).normals is None
     assert plain.merge(plain).normals is None
 
@@ -370,18 +371,20 @@ def test_merging_a_list_of_meshes_is_refused(two_boxes):
 
 @pytest.fixture
 def volume():
+    """Each voxel has another value: 6 columns, 5 rows and 4 slices of 0.5 x 0.7 x 2 mm."""
     return Volume(np.arange(4 * 5 * 6, dtype=np.int16).reshape(4, 5, 6), np.diag([0.5, 0.7, 2.0, 1.0]))
 
 
 @pytest.fixture
 def box_in_the_volume():
-    return Mesh(*samples.box((0.3, 0.6, 1.0)), report={"iso_value_hu": 226})
+    """A cube of 1 mm between the centres of the voxels of `volume`: its 8 vertices lie at z = 1 and z = 2."""
+    return Mesh(*samples.box(low=(0.3, 0.6, 1.0)), report={"iso_value_hu": 226})
 
 
 def test_a_mesh_is_sampled_at_its_vertices_between_voxels_or_in_the_nearest(volume, box_in_the_volume):
     vertices = box_in_the_volume.vertices
     between_voxels = box_in_the_volume.sample(volume).values["HU"]
-    in_the_nearest = box_in_the_volume.sample(volume, "nearest", 0).values["nearest"]
+    in_the_nearest = box_in_the_volume.sample(volume, name="nearest", order=0).values["nearest"]
     np.testing.assert_array_equal(between_voxels, volume.sample(vertices).astype(np.float32))
     np.testing.assert_array_equal(in_the_nearest, volume.sample(vertices, order=0))
     assert np.isfinite(between_voxels).all()
@@ -389,7 +392,7 @@ def test_a_mesh_is_sampled_at_its_vertices_between_voxels_or_in_the_nearest(volu
 
 def test_a_vertex_outside_of_the_volume_gets_the_given_value(volume, box_in_the_volume):
     first_slice = volume[:1]  # 2 mm thick: it ends at z = 1, where the lower four corners of the box lie
-    sampled = box_in_the_volume.sample(first_slice, "first", outside=-1024)
+    sampled = box_in_the_volume.sample(first_slice, name="first", outside=-1024)
     is_outside = box_in_the_volume.vertices[:, 2] == 2.0
     assert is_outside.sum() == 4
     np.testing.assert_array_equal(sampled.values["first"] == -1024, is_outside)
@@ -404,7 +407,7 @@ def test_sampling_leaves_the_values_and_the_report_of_the_given_mesh(volume, box
 
 @pytest.mark.parametrize("name", ["a.ply", "a.vtp"])
 def test_sampled_values_are_kept_by_mesh_files(volume, box_in_the_volume, tmp_path, name):
-    sampled = box_in_the_volume.sample(volume).sample(volume, "nearest", 0)
+    sampled = box_in_the_volume.sample(volume).sample(volume, name="nearest", order=0)
     sampled.save(tmp_path / name)
     kept = read_mesh(tmp_path / name).values
     assert kept.keys() == {"HU", "nearest"}
@@ -434,13 +437,13 @@ def test_sampling_from_a_mesh_in_place_of_a_volume_is_refused(kind, box_in_the_v
 
 def test_sampling_under_a_name_with_a_space_is_refused(volume, box_in_the_volume):
     with refused(UsageError, "_", "names"):
-        box_in_the_volume.sample(volume, "mean HU")
+        box_in_the_volume.sample(volume, name="mean HU")
 
 
 @pytest.fixture
 def numbered_faces():
     """A box of 12 triangles and one eight times as large of 12, numbered from 0 to 23, with HU at the 16 vertices."""
-    mesh = Mesh(*samples.box()).merge(Mesh(*samples.box((5.0, 0.0, 0.0), (2.0, 2.0, 2.0))))
+    mesh = Mesh(*samples.box()).merge(Mesh(*samples.box(low=(5.0, 0.0, 0.0), size=(2.0, 2.0, 2.0))))
     mesh.face_values["stress"] = np.arange(24.0)
     mesh.values["HU"] = np.arange(16.0)
     return mesh
@@ -466,7 +469,8 @@ def test_a_mirrored_mesh_keeps_the_numbers_at_its_faces(numbered_faces):
 
 
 def test_faces_of_a_merged_mesh_without_numbers_are_nan(numbered_faces):
-    merged = numbered_faces.merge(Mesh(*samples.box()))
+    box_without_numbers = Mesh(*samples.box())
+    merged = numbered_faces.merge(box_without_numbers)
     np.testing.assert_array_equal(merged.face_values["stress"], [*range(24), *[np.nan] * 12])
 
 
@@ -494,6 +498,6 @@ def test_numbers_at_faces_and_vertices_come_back_from_files_and_libraries(number
 
 
 def test_numbers_at_faces_that_are_too_few_are_refused(numbered_faces, tmp_path):
-    numbered_faces.face_values["stress"] = np.zeros(16)
+    numbered_faces.face_values["stress"] = np.zeros(16)  # for 24 faces
     with refused(UsageError, "face_values", "stress", 24):
         numbered_faces.save(tmp_path / "b.vtp")

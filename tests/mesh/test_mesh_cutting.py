@@ -16,15 +16,16 @@ CORNERS = np.array([(x, y, z) for z in (0, 4) for y in (0, 2) for x in (0, 1)], 
 SIDES = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
 """z = 0, z = 4, y = 0, y = 2, x = 0, x = 1; side n has the triangles 2 n and 2 n + 1."""
 TRIANGLES = np.array([half for a, b, c, d in SIDES for half in ((a, b, c), (a, c, d))])
+VOXEL_STEPS_MM = (0.5, 0.7, 2.0)
 AFAR = np.array([5e6, -3e6, 1e6])
 UP, DOWN = (0, 0, 1), (0, 0, -1)
 
 
-def box(move: np.ndarray | float = 0.0) -> Mesh:
+def box_1x2x4(move: np.ndarray | float = 0.0) -> Mesh:
     """A box of 1 x 2 x 4 mm with its lowest corner at `move`, and the height of each vertex over it as a value."""
-    made = Mesh(CORNERS + move, TRIANGLES, report={"affine_ijk_to_lps_mm": np.diag([0.5, 0.7, 2.0, 1.0]).tolist()})
-    made.values["height"] = CORNERS[:, 2].astype(np.float32)
-    return made
+    mesh = Mesh(CORNERS + move, TRIANGLES, report={"affine_ijk_to_lps_mm": np.diag([*VOXEL_STEPS_MM, 1.0]).tolist()})
+    mesh.values["height"] = CORNERS[:, 2].astype(np.float32)
+    return mesh
 
 
 near_and_afar = pytest.mark.parametrize("move", [0.0, AFAR], ids=["near", "afar"])
@@ -32,7 +33,7 @@ near_and_afar = pytest.mark.parametrize("move", [0.0, AFAR], ids=["near", "afar"
 
 @near_and_afar
 def test_a_clipped_solid_is_closed_and_has_area_and_volume_of_its_part(move: np.ndarray | float) -> None:
-    upper = box(move).clip(np.array([0.3, 9.0, 1.0]) + move, UP)  # 3 of its 4 mm of height
+    upper = box_1x2x4(move).clip(np.array([0.3, 9.0, 1.0]) + move, UP)  # 3 of its 4 mm of height
     quality = upper.quality()
     assert quality.closed
     assert quality.manifold
@@ -43,14 +44,14 @@ def test_a_clipped_solid_is_closed_and_has_area_and_volume_of_its_part(move: np.
 
 @near_and_afar
 def test_numbers_at_vertices_are_interpolated_where_a_plane_cuts(move: np.ndarray | float) -> None:
-    upper = box(move).clip(np.array([0.0, 0.0, 1.0]) + move, UP)
+    upper = box_1x2x4(move).clip(np.array([0.0, 0.0, 1.0]) + move, UP)
     heights = (upper.vertices - move)[:, 2]
     assert heights.min() == 1.0
     np.testing.assert_allclose(upper.values["height"], heights, atol=tolerances.FLOAT32_SHARE)
 
 
 def test_a_clipped_mesh_keeps_its_report() -> None:
-    assert box().clip((0, 0, 1), UP).report == box().report
+    assert box_1x2x4().clip((0, 0, 1), UP).report == box_1x2x4().report
 
 
 tiny_to_huge = pytest.mark.parametrize("length", [1e-320, 1e-200, 1e200])
@@ -58,35 +59,35 @@ tiny_to_huge = pytest.mark.parametrize("length", [1e-320, 1e-200, 1e200])
 
 @tiny_to_huge
 def test_a_clip_does_not_depend_on_the_length_of_the_normal(length: float) -> None:
-    assert box().clip((0, 0, 1), (0, 0, length)).volume == pytest.approx(1 * 2 * 3)
+    assert box_1x2x4().clip((0, 0, 1), (0, 0, length)).volume == pytest.approx(1 * 2 * 3)
 
 
 @tiny_to_huge
 def test_the_first_hit_does_not_depend_on_the_length_of_the_direction(length: float) -> None:
-    np.testing.assert_allclose(box().ray((0.4, 0.7, 1), (0, 0, length)), [[0.4, 0.7, 4.0]])
+    np.testing.assert_allclose(box_1x2x4().ray((0.4, 0.7, 1), (0, 0, length)), [[0.4, 0.7, 4.0]])
 
 
 def test_an_open_cut_has_all_faces_of_its_part_but_the_cap() -> None:
-    lower = box().clip((0, 0, 1), DOWN, capped=False)
+    lower = box_1x2x4().clip((0, 0, 1), DOWN, capped=False)
     assert lower.area == pytest.approx(1 * 2 + 2 * (1 + 2) * 1)  # the bottom, and four sides 1 mm high
     assert lower.quality().boundary_edges == 8  # the diagonal of each of four sides is cut too
 
 
 def test_capping_a_cut_of_an_open_mesh_is_refused() -> None:
-    opened = box().clip((0, 0, 1), DOWN, capped=False)
+    opened = box_1x2x4().clip((0, 0, 1), DOWN, capped=False)
     with refused(UsageError, "capped=False", "mesh"):
         opened.clip((0, 1, 0), (0, 1, 0))
 
 
 def test_an_open_mesh_is_cut_without_a_cap() -> None:
-    opened = box().clip((0, 0, 1), DOWN, capped=False)
+    opened = box_1x2x4().clip((0, 0, 1), DOWN, capped=False)
     half = opened.clip((0, 1, 0), (0, 1, 0), capped=False)
     assert half.area == pytest.approx((1 * 2 + 2 * (1 + 2) * 1) / 2)
 
 
 def box_with_numbered_sides() -> Mesh:
     """The box afar; each triangle has the number of its side, from 0 to 5."""
-    mesh = box(AFAR)
+    mesh = box_1x2x4(AFAR)
     mesh.face_values["side"] = np.repeat(np.arange(6.0), 2)
     return mesh
 
@@ -111,20 +112,20 @@ def test_a_plane_that_cuts_nothing_off_leaves_every_face_its_number() -> None:
 
 
 def test_a_plane_below_a_mesh_leaves_it_whole() -> None:
-    assert box().clip((0, 0, -3), UP).volume == pytest.approx(1 * 2 * 4)
+    assert box_1x2x4().clip((0, 0, -3), UP).volume == pytest.approx(1 * 2 * 4)
 
 
 def test_a_plane_above_a_mesh_that_leaves_nothing_is_refused_with_its_distance() -> None:
     with refused(NoSurfaceError, 3, "mesh"):
-        box().clip((0, 0, 7), UP)
+        box_1x2x4().clip((0, 0, 7), UP)
 
 
 def test_a_section_beside_a_mesh_has_no_line() -> None:
-    assert box().section((0, 0, 7), UP) == []
+    assert box_1x2x4().section((0, 0, 7), UP) == []
 
 
 def test_a_section_of_a_solid_is_its_closed_outline_in_the_plane() -> None:
-    (outline,) = box(AFAR).section(AFAR + (0, 0, 1.5), UP)
+    (outline,) = box_1x2x4(AFAR).section(AFAR + (0, 0, 1.5), UP)
     x, y, z = (outline - AFAR).T
     area = abs(x[:-1] @ y[1:] - x[1:] @ y[:-1]) / 2.0  # of a polygon, from its corners
     length = np.hypot(np.diff(x), np.diff(y)).sum()
@@ -134,36 +135,36 @@ def test_a_section_of_a_solid_is_its_closed_outline_in_the_plane() -> None:
 
 
 def test_a_section_of_an_open_mesh_ends_at_its_borders() -> None:
-    half = box().clip((0.5, 0, 0), (1, 0, 0), capped=False)  # open at x = 0.5
+    half = box_1x2x4().clip((0.5, 0, 0), (1, 0, 0), capped=False)  # open at x = 0.5
     (line,) = half.section((0, 0, 1), UP)
     assert sorted(line[[0, -1]].tolist()) == [[0.5, 0.0, 1.0], [0.5, 2.0, 1.0]]
 
 
 def test_nearest_points_are_found_with_their_distance_and_triangle() -> None:
     over_the_top, inside = (0.5, 1.0, 9.0), (0.9, 1.0, 2.0)
-    nearest, distances, rows = box(AFAR).closest_points([AFAR + over_the_top, AFAR + inside])
+    nearest, distances, rows = box_1x2x4(AFAR).closest_points([AFAR + over_the_top, AFAR + inside])
     np.testing.assert_allclose(nearest - AFAR, [[0.5, 1.0, 4.0], [1.0, 1.0, 2.0]], atol=tolerances.FLOAT64_PLACE_MM)
     np.testing.assert_allclose(distances, [5.0, 0.1], atol=tolerances.FLOAT64_PLACE_MM)
     assert (rows // 2).tolist() == [1, 5]  # the sides z = 4 and x = 1
 
 
 def test_a_ray_from_inside_hits_the_surface_ahead() -> None:
-    hits = box(AFAR).ray([AFAR + (0.4, 0.7, 1.0)], (0, 0, 5))
+    hits = box_1x2x4(AFAR).ray([AFAR + (0.4, 0.7, 1.0)], (0, 0, 5))
     np.testing.assert_allclose(hits - AFAR, [[0.4, 0.7, 4.0]], atol=tolerances.FLOAT64_PLACE_MM)
 
 
 def test_a_ray_from_afar_hits_the_first_surface() -> None:
-    hits = box().ray((0.4, 0.7, -1e4), (0, 0, 1e-3))
+    hits = box_1x2x4().ray((0.4, 0.7, -1e4), (0, 0, 1e-3))
     np.testing.assert_allclose(hits, [[0.4, 0.7, 0.0]], atol=tolerances.FLOAT64_PLACE_MM)
 
 
 def test_rays_behind_and_beside_a_mesh_hit_nothing() -> None:
-    hits = box(AFAR).ray([AFAR + (0.4, 0.7, 99.0), AFAR + (3, 3, 3)], UP)
+    hits = box_1x2x4(AFAR).ray([AFAR + (0.4, 0.7, 99.0), AFAR + (3, 3, 3)], UP)
     assert np.isnan(hits).all()
 
 
 def test_a_box_has_no_self_intersections() -> None:
-    assert len(box().self_intersections()) == 0
+    assert len(box_1x2x4().self_intersections()) == 0
 
 
 def test_triangles_that_cut_each_other_are_found() -> None:
@@ -193,11 +194,11 @@ WRONG = {
 def test_planes_points_and_meshes_that_cannot_be_used_are_refused(name: str) -> None:
     call, words = WRONG[name]
     with pytest.raises(UsageError, match=words):
-        call(box())  # type: ignore[no-untyped-call]
+        call(box_1x2x4())  # type: ignore[no-untyped-call]
 
 
 def test_voxel_length_of_a_mesh_is_the_shortest_step_of_its_affine() -> None:
-    assert box().voxel_mm == 0.5
+    assert box_1x2x4().voxel_mm == min(VOXEL_STEPS_MM)
 
 
 def test_a_mesh_without_an_affine_has_no_voxel_length() -> None:
@@ -205,16 +206,15 @@ def test_a_mesh_without_an_affine_has_no_voxel_length() -> None:
 
 
 def test_a_turned_mesh_keeps_its_voxel_length_but_not_its_affine() -> None:
-    turned = box().transformed(
-        [[0, -1, 0, 7], [1, 0, 0, 0], [0, 0, 3, 0], [0, 0, 0, 1]]
-    )  # its x and y keep their length
-    assert turned.voxel_mm == pytest.approx(0.5)
+    quarter_turn = [[0, -1, 0, 7], [1, 0, 0, 0], [0, 0, 3, 0], [0, 0, 0, 1]]  # steps of x and y keep their length
+    turned = box_1x2x4().transformed(quarter_turn)
+    assert turned.voxel_mm == pytest.approx(min(VOXEL_STEPS_MM))
     assert "affine_ijk_to_lps_mm" not in turned.report
 
 
 def test_an_enlarged_mesh_has_an_enlarged_voxel_length() -> None:
-    once = box().transformed(np.eye(4))
-    assert once.transformed(np.diag([2, 2, 2, 1])).voxel_mm == pytest.approx(1.0)
+    once = box_1x2x4().transformed(np.eye(4))
+    assert once.transformed(np.diag([2, 2, 2, 1])).voxel_mm == pytest.approx(2 * min(VOXEL_STEPS_MM))
 
 
 @pytest.mark.parametrize(
@@ -229,7 +229,7 @@ def test_an_enlarged_mesh_has_an_enlarged_voxel_length() -> None:
 def test_the_voxel_length_stays_with_a_mesh_that_is_converted_or_cut_so_that_it_can_be_decimated(
     convert: Callable[[Mesh], Mesh],
 ) -> None:
-    converted = convert(box())
-    assert converted.voxel_mm == 0.5
+    converted = convert(box_1x2x4())
+    assert converted.voxel_mm == min(VOXEL_STEPS_MM)
     decimated = decimate_mesh(converted, fraction=0.1)
     assert decimated.triangle_count <= converted.triangle_count  # of a box without its corners little would be left

@@ -18,7 +18,9 @@ from clrecon.exchange.formats import MESH_INPUTS
 from clrecon.exchange.stl import join_corners
 from clrecon.exchange.vtp import has_polygons
 
-BALL = Mesh(*ball(8.0, 12))
+RADIUS_MM = 8.0
+BALL = Mesh(*ball(RADIUS_MM, rings=12))
+BALL_NORMALS = BALL.vertices / RADIUS_MM
 
 
 every_format = pytest.mark.parametrize("extension", MESH_INPUTS)
@@ -26,17 +28,17 @@ both_frames = pytest.mark.parametrize("space", ["lps", "ras"])
 
 
 @pytest.fixture
-def written(tmp_path: Path, extension: str, space: str) -> Path:
+def ball_file(tmp_path: Path, extension: str, space: str) -> Path:
     """A file of the ball, with normals and the entry iso_value_hu of its report."""
     path = tmp_path / f"ball{extension}"
-    Mesh(BALL.vertices, BALL.triangles, BALL.vertices / 8.0, {"iso_value_hu": 250.0}).save(path, space)
+    Mesh(BALL.vertices, BALL.triangles, BALL_NORMALS, {"iso_value_hu": 250.0}).save(path, space)
     return path
 
 
 @every_format
 @both_frames
-def test_corners_of_a_written_mesh_are_read_back_to_the_bit_and_closed(written: Path) -> None:
-    back = clrecon.read_mesh(written)
+def test_corners_of_a_written_mesh_are_read_back_to_the_bit_and_closed(ball_file: Path) -> None:
+    back = clrecon.read_mesh(ball_file)
     assert np.array_equal(back.vertices[back.triangles], BALL.vertices[BALL.triangles])
     assert back.vertex_count == BALL.vertex_count
     assert back.quality().closed
@@ -44,26 +46,26 @@ def test_corners_of_a_written_mesh_are_read_back_to_the_bit_and_closed(written: 
 
 @every_format
 @both_frames
-def test_frame_of_a_written_mesh_is_read_from_the_file_without_a_warning(written: Path, space: str) -> None:
-    facts = clrecon.read_mesh(written).report["file"]
+def test_frame_of_a_written_mesh_is_read_from_the_file_without_a_warning(ball_file: Path, space: str) -> None:
+    facts = clrecon.read_mesh(ball_file).report["file"]
     assert (facts["space"], facts["space_from"], facts["warnings"]) == (space.upper(), "file", [])
 
 
 @pytest.mark.parametrize("extension", [".ply"])
 @both_frames
-def test_ply_gives_back_normals_order_of_triangles_and_report(written: Path) -> None:
-    back = clrecon.read_mesh(written)
+def test_ply_gives_back_normals_order_of_triangles_and_report(ball_file: Path) -> None:
+    back = clrecon.read_mesh(ball_file)
     assert np.array_equal(back.triangles, BALL.triangles)
     assert back.normals is not None
-    assert np.allclose(back.normals, BALL.vertices / 8.0, atol=tolerances.MESH_UNIT_NORMAL)
+    assert np.allclose(back.normals, BALL_NORMALS, atol=tolerances.MESH_UNIT_NORMAL)
     assert back.report["iso_value_hu"] == 250.0
 
 
 @every_format
 @both_frames
-def test_reading_a_mesh_in_a_frame_that_its_file_contradicts_is_refused(written: Path, space: str) -> None:
+def test_reading_a_mesh_in_a_frame_that_its_file_contradicts_is_refused(ball_file: Path, space: str) -> None:
     with refused(UsageError, "space"):
-        clrecon.read_mesh(written, space="ras" if space == "lps" else "lps")
+        clrecon.read_mesh(ball_file, space="ras" if space == "lps" else "lps")
 
 
 FACET = "facet normal 0 0 1\n outer loop\n  vertex 1 2 3\n  vertex 4 2 3\n  vertex 1 6e0 3\n endloop\nendfacet\n"
@@ -131,7 +133,8 @@ def test_equal_corners_of_triangles_become_one_vertex() -> None:
 def test_corners_that_are_not_finite_leave_both_triangles() -> None:
     with_nan = CORNERS.copy()
     with_nan[2, 0] = np.nan
-    assert len(join_corners(with_nan)[1]) == 2
+    _, triangles = join_corners(with_nan)
+    assert len(triangles) == 2
 
 
 def stl_with_nan(stl: bytes) -> bytes:

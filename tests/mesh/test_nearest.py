@@ -70,7 +70,7 @@ def test_of_triangles_at_equal_distance_the_first_is_found():
 @pytest.mark.parametrize("from_centre_mm", [0.0, 3.0, 9.9, 14.0])
 def test_distance_to_a_sphere_is_that_to_the_nearest_of_many_points_on_its_triangles(from_centre_mm):
     centre = np.array([1000.0, -2000.0, 500.0])
-    vertices, triangles = samples.sphere(centre, 10.0, 4)
+    vertices, triangles = samples.sphere(centre, radius=10.0, rounds=4)
     point = centre + from_centre_mm * np.array([0.36, -0.48, 0.8])  # a direction of length 1
 
     _, distance = nearest((vertices, triangles), point)
@@ -120,6 +120,5 @@ def test_only_triangles_whose_box_is_near_are_measured_exactly(monkeypatch):
     _, distance = nearest(cubes, (30.5, 0.5, 2.0))
 
     assert distance == pytest.approx(1.0)
-    assert measured == [
-        2 + 2 * 4
-    ]  # of one cube: two triangles on top, and two on each side, whose boxes reach up to it
+    on_top, on_the_sides = 2, 4 * 2  # triangles of one cube: the boxes of those on its sides reach up to the top
+    assert measured == [on_top + on_the_sides]

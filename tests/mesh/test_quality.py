@@ -34,7 +34,7 @@ def figures(quality: dict, *names: str) -> tuple:
 
 
 def test_quality_of_a_box_far_from_the_origin_has_every_figure_of_a_sound_mesh():
-    quality = measure(samples.box(FAR, (2.0, 3.0, 5.5)))
+    quality = measure(samples.box(low=FAR, size=(2.0, 3.0, 5.5)))
     assert quality == {
         "vertices": 8,
         "triangles": 12,
@@ -72,28 +72,27 @@ def test_counts_are_whole_numbers_as_in_json():
 
 
 def test_volume_of_a_torus_is_the_sum_of_its_tetrahedra():
-    volume_ml = measure(samples.torus())["volume_ml"]
-    assert volume_ml == pytest.approx(samples.torus_volume_ml(), rel=tolerances.MESH_VOLUME)
-    # The triangles lie inside of the round torus (major 20, minor 6 mm): measured 0.87 of its volume.
-    round_ml = 2 * np.pi**2 * 20.0 * 6.0**2 / 1000.0
+    radii_mm = {"major": 20.0, "minor": 6.0}
+    volume_ml = measure(samples.torus(**radii_mm))["volume_ml"]
+    assert volume_ml == pytest.approx(samples.torus_volume_ml(**radii_mm), rel=tolerances.MESH_VOLUME)
+    # The triangles lie inside of the round torus: measured 0.87 of its volume.
+    round_ml = 2 * np.pi**2 * radii_mm["major"] * radii_mm["minor"] ** 2 / 1000.0
     assert 0.8 * round_ml < volume_ml < round_ml
 
 
 @pytest.fixture
 def two_spheres_and_a_cavity():
     """Quality of spheres of 10 and 7 mm, with a cavity of 4 mm in the first."""
-    large, small, cavity = (
-        samples.sphere((-30, 5, 2), 10),
-        samples.sphere((40, 0, 0), 7),
-        samples.sphere((-30, 5, 2), 4),
-    )
-    inward = (cavity[0], cavity[1][:, ::-1])
-    return measure(samples.join(large, small, inward))
+    large = samples.sphere((-30, 5, 2), radius=10)
+    small = samples.sphere((40, 0, 0), radius=7)
+    vertices, triangles = samples.sphere((-30, 5, 2), radius=4)
+    cavity = (vertices, triangles[:, ::-1])
+    return measure(samples.join(large, small, cavity))
 
 
 def test_two_spheres_and_a_cavity_are_three_closed_components_without_a_handle(two_spheres_and_a_cavity):
     names = ("closed", "manifold", "components", "euler_number", "genus")
-    assert figures(two_spheres_and_a_cavity, *names) == (True, True, 3, 6, 0)
+    assert figures(two_spheres_and_a_cavity, *names) == (True, True, 3, 3 * 2, 0)
 
 
 def test_volume_of_a_cavity_is_taken_off_and_its_area_is_added(two_spheres_and_a_cavity):
@@ -119,7 +118,7 @@ def test_a_missing_face_leaves_three_boundary_edges_an_euler_number_of_1_and_no_
 
 
 def test_volume_of_an_open_surface_does_not_depend_on_its_place():
-    vertices, triangles = samples.box((0, 0, 0), (2, 2, 2))
+    vertices, triangles = samples.box(size=(2, 2, 2))
     opened = np.delete(triangles, 4, axis=0)
     here = measure((vertices, opened))["volume_ml"]
     there = measure((vertices + (4096, -8192, 512), opened))["volume_ml"]
@@ -142,7 +141,7 @@ def test_moebius_strip_is_neither_oriented_nor_manifold_and_has_one_boundary():
 
 
 def test_boxes_that_share_a_corner_are_closed_and_not_manifold_at_one_vertex():
-    quality = measure(samples.weld(samples.join(samples.box(), samples.box((1, 1, 1)))))
+    quality = measure(samples.weld(samples.join(samples.box(), samples.box(low=(1, 1, 1)))))
     assert quality["vertices"] == 2 * 8 - 1
     assert figures(quality, "closed", "oriented", "nonmanifold_edges", "nonmanifold_vertices") == (True, True, 0, 1)
     assert figures(quality, "manifold", "components", "genus") == (False, 1, None)
@@ -155,7 +154,7 @@ def test_two_triangles_that_share_one_corner_alone_are_not_manifold():
 
 
 def test_boxes_that_share_an_edge_are_not_manifold_and_not_closed():
-    quality = measure(samples.weld(samples.join(samples.box(), samples.box((1, 1, 0)))))
+    quality = measure(samples.weld(samples.join(samples.box(), samples.box(low=(1, 1, 0)))))
     assert figures(quality, "nonmanifold_edges", "closed", "manifold", "boundary_edges") == (1, False, False, 0)
     assert quality["genus"] is None
 
@@ -224,7 +223,7 @@ def test_a_triangle_that_names_a_missing_vertex_is_refused():
 @pytest.mark.parametrize("edge", [[0, 1], [1, 2], [2, 0]], ids=["first", "second", "third"])
 def test_shortest_edge_is_measured_wherever_it_stands_in_its_triangle(edge):
     """One edge of a triangle of the box shrinks to 1/64: it is the shortest, 2 to 6.3 mm before."""
-    vertices, triangles = samples.box((0, 0, 0), (2.0, 3.0, 5.5))
+    vertices, triangles = samples.box(size=(2.0, 3.0, 5.5))
     low, high = triangles[7, edge]
     towards = (vertices[high] - vertices[low]) / 64
     vertices[high] = vertices[low] + towards
@@ -261,7 +260,7 @@ def test_split_vertices_are_the_same_by_neighbouring_half_edges_and_by_joined_co
     opposite = opposite_half_edges(triangles, edges)
     by_half_edges = find_split_vertices(triangles, count, edges, opposite)
     by_corners = find_split_vertices(triangles, count, edges)
-    assert 3 <= len(by_corners) <= 5  # five vertices were drawn from 18, some of them perhaps twice
+    assert 3 <= len(by_corners) <= 5  # one of 18 vertices was drawn for each of five spheres, some perhaps twice
     np.testing.assert_array_equal(by_half_edges, by_corners)
 
 
@@ -320,12 +319,12 @@ def test_edges_between_the_highest_vertex_numbers_are_counted():
 
 @pytest.mark.parametrize(
     ("second_at", "coincident", "open_edges"),
-    [((2, 2, 0), 0, 0), ((1, 1, 0), 4, 1), ((1, 1, 1), 2, 0)],
+    [((2, 2, 0), 0, 0), ((1, 1, 0), 2 * 2, 1), ((1, 1, 1), 2 * 1, 0)],
     ids=["apart", "common edge", "common corner"],
 )
 def test_vertices_at_one_place_are_joined_before_a_surface_is_called_closed(second_at, coincident, open_edges):
-    """Two closed boxes: STL would join vertices at one place, and put a common edge into four faces."""
-    quality = measure(samples.join(samples.box(), samples.box(second_at)))
+    """Two closed cubes of 1 mm: STL would join vertices at one place, and put a common edge into four faces."""
+    quality = measure(samples.join(samples.box(), samples.box(low=second_at)))
     assert figures(quality, "boundary_edges", "nonmanifold_edges") == (0, 0)
     assert figures(quality, "coincident_vertices", "open_edges_by_place") == (coincident, open_edges)
     assert quality["closed"] == (open_edges == 0)
