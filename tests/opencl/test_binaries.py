@@ -19,6 +19,7 @@ KEY = binary_key("device", "source")
 
 @pytest.fixture(autouse=True)
 def own_cache(tmp_path, monkeypatch):
+    """The folder of binaries of one test, empty."""
     folder = tmp_path / "kernels"
     make_private(folder)
     caches = prepare_caches()._replace(binaries=folder)
@@ -27,7 +28,7 @@ def own_cache(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def keeper(device, monkeypatch):
+def keeping_pocl(device, monkeypatch):
     """A device whose driver keeps nothing: PoCL, whose binaries clrecon then keeps."""
     if not quirks.is_pocl(device.platform):
         pytest.skip("no driver here that gives and takes binaries")
@@ -123,36 +124,36 @@ def forget_programs(device, monkeypatch):
     monkeypatch.setattr(device, "programs", {})
 
 
-def test_program_is_stored_once_and_loaded_by_later_processes(keeper, monkeypatch):
+def test_program_is_stored_once_and_loaded_by_later_processes(keeping_pocl, monkeypatch):
     stored = []
     monkeypatch.setattr(program, "store_binary", lambda *kept: stored.append(kept) or store_binary(*kept))
     for _ in range(3):
-        forget_programs(keeper, monkeypatch)
-        assert load_program(keeper, "primitives/compact.cl").kernel_names == ["count_set_bits", "list_set_bits"]
+        forget_programs(keeping_pocl, monkeypatch)
+        assert load_program(keeping_pocl, "primitives/compact.cl").kernel_names == ["count_set_bits", "list_set_bits"]
     assert len(stored) == 1
 
 
-def test_loaded_binary_computes_what_its_source_does(keeper, monkeypatch):
+def test_loaded_binary_computes_what_its_source_does(keeping_pocl, monkeypatch):
     from clrecon.opencl import upload
     from clrecon.operators.primitives.scan import compact
 
     mask = np.random.default_rng(0).integers(0, 2**32, 1000, dtype=np.uint32)
     set_bits = int(np.unpackbits(mask.view(np.uint8)).sum())
     for _ in ("built from source", "loaded from its binary"):
-        forget_programs(keeper, monkeypatch)
-        assert compact(keeper, upload(keeper, mask), len(mask)).count == set_bits
+        forget_programs(keeping_pocl, monkeypatch)
+        assert compact(keeping_pocl, upload(keeping_pocl, mask), len(mask)).count == set_bits
 
 
-def test_program_whose_binary_the_driver_refuses_is_built_from_source(keeper, monkeypatch):
+def test_program_whose_binary_the_driver_refuses_is_built_from_source(keeping_pocl, monkeypatch):
     no_options = ()
-    key = program._key(keeper, read_kernel_source("primitives/compact.cl"), no_options)
+    key = program._key(keeping_pocl, read_kernel_source("primitives/compact.cl"), no_options)
     store_binary(key, b"no program at all")
-    forget_programs(keeper, monkeypatch)
-    assert load_program(keeper, "primitives/compact.cl").kernel_names == ["count_set_bits", "list_set_bits"]
+    forget_programs(keeping_pocl, monkeypatch)
+    assert load_program(keeping_pocl, "primitives/compact.cl").kernel_names == ["count_set_bits", "list_set_bits"]
 
 
-def test_program_without_kernels_is_refused_with_its_file(keeper, monkeypatch):
+def test_program_without_kernels_is_refused_with_its_file(keeping_pocl, monkeypatch):
     monkeypatch.setattr(program.Program, "kernel_names", [])
-    forget_programs(keeper, monkeypatch)
+    forget_programs(keeping_pocl, monkeypatch)
     with refused(DeviceError, "kernel", "compact.cl"):
-        load_program(keeper, "primitives/compact.cl")
+        load_program(keeping_pocl, "primitives/compact.cl")

@@ -15,23 +15,26 @@ PICTURE = ("rays/leaps.cl", "rays/tiles.cl", "rays/composite.cl")
 
 
 @pytest.fixture
-def opened(device):
-    """The device without any program."""
+def bare_device(device):
+    """The device as a new process has it: nothing is built."""
     return Device(device.index, device.cl_device.platform, device.cl_device)
 
 
-def test_files_loaded_in_a_block_are_one_program(opened):
-    with building_together(opened):
-        load_program(opened, "primitives/compact.cl")
-        load_program(opened, "primitives/union_find.cl")
-    assert load_program(opened, "primitives/compact.cl") is load_program(opened, "primitives/union_find.cl")
+def test_files_loaded_in_a_block_are_one_program(bare_device):
+    with building_together(bare_device):
+        load_program(bare_device, "primitives/compact.cl")
+        load_program(bare_device, "primitives/union_find.cl")
+    assert load_program(bare_device, "primitives/compact.cl") is load_program(bare_device, "primitives/union_find.cl")
 
 
-def test_file_that_a_variant_of_another_would_change_is_refused(opened):
-    with pytest.raises(AssertionError, match=r"masks/classify.cl would be built with VOXEL"), building_together(opened):
-        load_program(opened, "masks/classify.cl", {"VOXEL": "short"})
-        load_program(opened, "surface/marching_cubes.cl", {"VOXEL": "float"})
-    assert not opened.programs
+def test_file_that_a_variant_of_another_would_change_is_refused(bare_device):
+    with (
+        pytest.raises(AssertionError, match=r"masks/classify.cl would be built with VOXEL"),
+        building_together(bare_device),
+    ):
+        load_program(bare_device, "masks/classify.cl", {"VOXEL": "short"})
+        load_program(bare_device, "surface/marching_cubes.cl", {"VOXEL": "float"})
+    assert not bare_device.programs
 
 
 @pytest.mark.parametrize(

@@ -75,7 +75,7 @@ def test_cache_folder_that_cannot_be_used_leaves_one_warning_and_no_file(device,
 @pytest.mark.fault_row(59)
 def test_every_command_with_a_device_warns_once_of_an_unsafe_cache_folder(command, device, tmp_path, phantom_folder):
     """The folder of pickles is refused; kernels are found as ever, so that nothing is built for this test."""
-    make_faulty(tmp_path / "home" / "pytools", "others")
+    make_faulty(tmp_path / "home" / "pytools", fault="others")
     arguments = {
         "devices": [],
         "mesh": [str(phantom_folder), "-o", str(tmp_path / "a.stl"), "--hu", "300"],
@@ -129,6 +129,7 @@ def test_report_of_the_bench_has_the_warnings_of_its_devices(device):
 
 @pytest.fixture(scope="module")
 def phantom_folder(shared_folder):
+    """A series of 24 slices of a sphere."""
     from clrecon.proof.phantom import PhantomSettings, write_phantom
 
     def make(folder):
@@ -297,7 +298,7 @@ def test_caches_of_pyopencl_mesa_and_binaries_are_switched_off_where_other_users
     prepare_fresh_caches, tmp_path
 ):
     for place in ("pytools", "mesa_shader_cache", "clrecon/kernels"):
-        make_faulty(tmp_path / "home" / place, "others")
+        make_faulty(tmp_path / "home" / place, fault="others")
 
     caches = prepare_fresh_caches()
 
@@ -348,7 +349,7 @@ def test_kernels_are_refused_where_no_folder_has_room_for_them(prepare_fresh_cac
 
 @pytest.mark.parametrize(
     ("ulimit", "cause"), daily_rows(1, [("-f 100", "files may have 0.10 MB here"), ("-v 500000", "want of memory")])
-)
+)  # in blocks of 1024 bytes
 @pytest.mark.fault_row(59)
 def test_error_under_a_limit_of_the_process_names_the_limit(ulimit, cause, device, tmp_path):
     python = [sys.executable, "-c", SUM_ON_DEVICE, str(device.index)]

@@ -63,6 +63,7 @@ def fake_device(index: int, *, score: int, shortcoming: str = "") -> Any:
 
 @pytest.fixture
 def three_devices(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """All devices of the machine: a good CPU, a better one, and the best, which has no compiler."""
     devices = [fake_device(0, score=1), fake_device(1, score=2), fake_device(2, score=9, shortcoming="no compiler")]
     monkeypatch.setattr(select, "list_devices", lambda: devices)
     return devices
@@ -149,7 +150,7 @@ def test_device_of_opencl_1_2_or_later_has_no_shortcoming(version: str) -> None:
 
 
 def test_status_of_a_command_is_asked_until_it_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:
-    left = [3, 2, 1, 0]
+    left = [3, 2, 1, 0]  # queued, submitted, running, ended
 
     class Event:
         @property

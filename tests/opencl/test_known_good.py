@@ -44,14 +44,14 @@ def warnings_of_process(device, folder, end="well"):
 
 
 @pytest.fixture
-def built(device, shared_folder, tmp_path):
+def folder_of_kernels(device, shared_folder, tmp_path):
     """A copy of a folder in which a process has built two programs."""
     if not is_pocl(device.platform):
         pytest.skip("this driver does not end the process")
-    made = shared_folder / f"built-on-{device.index}"
-    if not made.exists():
-        assert warnings_of_process(device, made / "clrecon") == []
-    return shutil.copytree(made / "clrecon", tmp_path / "clrecon")
+    original = shared_folder / f"built-on-{device.index}" / "clrecon"
+    if not original.exists():
+        assert warnings_of_process(device, original) == []
+    return shutil.copytree(original, tmp_path / "clrecon")
 
 
 def files_of(folder, suffix):
@@ -85,20 +85,20 @@ def swap_two_programs(folder):
 @pytest.mark.release
 @pytest.mark.parametrize("damage", daily(2, [overwrite_all, swap_two_programs, cut_programs, empty_kernels]))
 @pytest.mark.fault_row(59)
-def test_damaged_kernels_are_built_anew_with_a_warning_once(damage, device, built):
-    damage(built)
-    assert warnings_of_process(device, built) == [DAMAGED]
-    assert warnings_of_process(device, built) == []  # the next process finds them whole
+def test_damaged_kernels_are_built_anew_with_a_warning_once(damage, device, folder_of_kernels):
+    damage(folder_of_kernels)
+    assert warnings_of_process(device, folder_of_kernels) == [DAMAGED]
+    assert warnings_of_process(device, folder_of_kernels) == []  # the next process finds them whole
 
 
 @pytest.mark.seconds
 @pytest.mark.fault_row(59)
-def test_kernels_without_a_record_are_built_anew_with_a_warning_once(device, built):
+def test_kernels_without_a_record_are_built_anew_with_a_warning_once(device, folder_of_kernels):
     """As after a process that died: PoCL's files are there, cut by a full disk, and nobody has seen them work."""
-    shutil.rmtree(built / "records")
-    cut_programs(built)
-    assert warnings_of_process(device, built) == [UNFINISHED]
-    assert warnings_of_process(device, built) == []
+    shutil.rmtree(folder_of_kernels / "records")
+    cut_programs(folder_of_kernels)
+    assert warnings_of_process(device, folder_of_kernels) == [UNFINISHED]
+    assert warnings_of_process(device, folder_of_kernels) == []
 
 
 @pytest.mark.release
@@ -107,10 +107,11 @@ def test_kernels_without_a_record_are_built_anew_with_a_warning_once(device, bui
 def test_kernels_of_a_process_that_was_killed_are_not_recorded_and_the_next_warns(device, tmp_path):
     if not is_pocl(device.platform):
         pytest.skip("this driver does not end the process")
-    warnings_of_process(device, tmp_path / "clrecon", end="killed")
-    assert files_of(tmp_path / "clrecon", ".bc")
-    assert list((tmp_path / "clrecon" / "records").iterdir()) == []
-    assert warnings_of_process(device, tmp_path) == [UNFINISHED]
+    folder = tmp_path / "clrecon"
+    warnings_of_process(device, folder, end="killed")
+    assert files_of(folder, ".bc")
+    assert list((folder / "records").iterdir()) == []
+    assert warnings_of_process(device, folder) == [UNFINISHED]
 
 
 # Without a driver: a folder with files as PoCL writes them, and records of those that worked

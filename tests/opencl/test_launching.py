@@ -45,8 +45,8 @@ def test_kernel_takes_its_arguments_by_name_in_any_order(device):
     launch(device, sum_blocks_kernel(device), device.group_size, **backwards)
 
     [block_sum] = download(device, np.empty(1, np.uint32), arguments["block_sums"])
-    counts_in_block = min(50, 16 * device.group_size)
-    assert block_sum == sum(range(counts_in_block))
+    counts_in_block = min(arguments["n"], 16 * device.group_size)
+    assert block_sum == sum(range(counts_in_block))  # the counts are 0, 1, 2 ...
 
 
 @pytest.mark.parametrize(
@@ -107,11 +107,11 @@ def test_launches_after_pyopencl_knows_the_argument_types_give_what_the_first_gi
     lowest_and_highest = np.array([[0, 5], [7, 9], [3, 7], [1, 2]], dtype)
     below, above, between = 0, 1, 2  # states of the four bricks at the iso value 7
     ranges = BrickRanges(upload(device, lowest_and_highest), (1, 2, 2), np.dtype(dtype))
-    found = []
+    launches = []
     for _ in range(LAUNCHES_BEFORE_TYPES + 2):
-        states = compare_bricks(device, ranges, np.dtype(dtype).type(7), 8, 0)
-        found.append(download(device, np.empty(4, np.uint8), states.states_d).tolist())
-    assert found == [[below, above, between, below]] * (LAUNCHES_BEFORE_TYPES + 2)
+        states = compare_bricks(device, ranges, level=np.dtype(dtype).type(7), ni=8, border=0)
+        launches.append(download(device, np.empty(4, np.uint8), states.states_d).tolist())
+    assert launches == [[below, above, between, below]] * (LAUNCHES_BEFORE_TYPES + 2)
 
 
 @pytest.mark.parametrize("name", kernel_files())

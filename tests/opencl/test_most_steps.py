@@ -27,7 +27,7 @@ def run_loop(device, steps):
     cl.enqueue_copy(device.queue, raw(counts_d), np.array([0, 0], np.uint32))
     kernel = cl.Program(device.context, SOURCE).build().count_steps
     kernel(device.queue, (1,), (1,), raw(counts_d), np.uint32(steps))
-    odd_steps = int(download(device, np.empty(2, np.uint32), counts_d)[1])
+    _, odd_steps = download(device, np.empty(2, np.uint32), counts_d).tolist()
     return 2 * odd_steps
 
 

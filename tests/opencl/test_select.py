@@ -18,7 +18,7 @@ from clrecon.opencl.quirks import import_pyopencl
 class FakeDevice:
     """What `choose_device` looks at."""
 
-    def __init__(self, index, name, platform, kind, memory=2**30, simulator=False, software=False):
+    def __init__(self, index, name, platform, kind, *, memory, simulator=False, software=False):
         self.index, self.name, self.platform, self.type = index, name, platform, kind
         self.usable_bytes, self.is_simulator, self.cl_device = memory, simulator, name
         self.max_allocation_bytes = memory // 4
@@ -30,15 +30,20 @@ class FakeDevice:
         self.score = (rank, False, 1, (1,), memory, -index)
 
 
+SIMULATOR, CPU, RADEON, H200, RASTERISER = range(5)
+"""Indices of the devices of `machine`."""
+MIB = 2**20
+
+
 @pytest.fixture
 def machine(monkeypatch):
     """A machine with a simulator in front, a CPU, two GPUs and a rasteriser."""
     devices = [
-        FakeDevice(0, "Oclgrind Simulator", "Oclgrind", "gpu", 2**40, simulator=True),
-        FakeDevice(1, "pthread-Xeon", "Portable Computing Language", "cpu", 2**35),
-        FakeDevice(2, "Radeon", "AMD", "gpu", 2**33),
-        FakeDevice(3, "H200", "NVIDIA CUDA", "gpu", 2**37),
-        FakeDevice(4, "llvmpipe", "rusticl", "cpu", 2**36, software=True),
+        FakeDevice(SIMULATOR, "Oclgrind Simulator", "Oclgrind", "gpu", memory=2**40, simulator=True),
+        FakeDevice(CPU, "pthread-Xeon", "Portable Computing Language", "cpu", memory=32_768 * MIB),
+        FakeDevice(RADEON, "Radeon", "AMD", "gpu", memory=2**33),
+        FakeDevice(H200, "H200", "NVIDIA CUDA", "gpu", memory=2**37),
+        FakeDevice(RASTERISER, "llvmpipe", "rusticl", "cpu", memory=2**36, software=True),
     ]
     monkeypatch.setattr(select, "list_devices", lambda: list(devices))
     monkeypatch.delenv("CLRECON_DEVICE", raising=False)
@@ -84,7 +89,7 @@ def test_unknown_device_of_the_environment_is_refused_with_the_name_of_the_varia
 
 
 def test_simulator_is_not_chosen_unless_it_is_named(machine, monkeypatch):
-    simulator = machine[0]
+    simulator = machine[SIMULATOR]
     monkeypatch.setattr(select, "list_devices", lambda: [simulator])
     with refused(DeviceError, "Oclgrind", "Simulator", simulator.index):
         choose_device()
@@ -120,12 +125,12 @@ def test_simulator_chosen_by_its_index_alone_has_a_warning(machine, wanted, vari
 
 @pytest.mark.parametrize("wanted", [None, "gpu"])
 def test_device_with_a_shortcoming_is_passed_over_for_the_next_best(machine, wanted):
-    machine[3].shortcoming = "it has no compiler"
+    machine[H200].shortcoming = "it has no compiler"
     assert choose_device(wanted).name == "Radeon"
 
 
 def test_device_with_a_shortcoming_is_refused_when_it_is_named(machine):
-    machine[3].shortcoming = "it has no compiler"
+    machine[H200].shortcoming = "it has no compiler"
     with refused(DeviceError, "H200", "NVIDIA", "compiler"):
         choose_device("h200")
 
@@ -159,7 +164,7 @@ MEMORY_OF_ITS_OWN, COMPUTE_UNITS, DRIVER = 1, 2, 3
 
 
 @pytest.fixture
-def faultless(machine, monkeypatch):
+def sound_machine(machine, monkeypatch):
     """The machine, with no remembered fault."""
     monkeypatch.setattr(select, "remembered_fault", lambda device: "")
     return machine
@@ -168,34 +173,34 @@ def faultless(machine, monkeypatch):
 @pytest.mark.parametrize(
     ("wanted", "explanation"),
     [
-        (None, "before 2: it has more memory"),
-        ("gpu", "named, before 2: it has more memory"),
+        (None, f"before {RADEON}: it has more memory"),
+        ("gpu", f"named, before {RADEON}: it has more memory"),
         ("radeon", "named, no other one"),
     ],
 )
-def test_choice_is_explained_by_the_next_best_device_and_whether_it_was_named(faultless, wanted, explanation):
+def test_choice_is_explained_by_the_next_best_device_and_whether_it_was_named(sound_machine, wanted, explanation):
     assert select.explain_choice(wanted) == explanation
 
 
 @pytest.mark.parametrize(
     ("place", "better", "explanation"),
     [
-        (DRIVER, (2,), "before 3: its driver is newer"),
-        (COMPUTE_UNITS, 2, "before 3: it has more compute units"),
-        (MEMORY_OF_ITS_OWN, True, "before 3: it has memory of its own"),
+        (DRIVER, (2,), f"before {H200}: its driver is newer"),
+        (COMPUTE_UNITS, 2, f"before {H200}: it has more compute units"),
+        (MEMORY_OF_ITS_OWN, True, f"before {H200}: it has memory of its own"),
     ],
     ids=["newer driver", "more compute units", "own memory"],
 )
-def test_choice_is_explained_by_the_part_of_the_score_that_is_better(faultless, place, better, explanation):
-    radeon = faultless[2]
+def test_choice_is_explained_by_the_part_of_the_score_that_is_better(sound_machine, place, better, explanation):
+    radeon = sound_machine[RADEON]
     radeon.score = (*radeon.score[:place], better, *radeon.score[place + 1 :])
     assert select.explain_choice() == explanation
 
 
-def test_choice_of_a_cpu_before_a_rasteriser_is_explained_by_their_types(faultless, monkeypatch):
-    _, cpu, _, _, rasteriser = faultless
+def test_choice_of_a_cpu_before_a_rasteriser_is_explained_by_their_types(sound_machine, monkeypatch):
+    _, cpu, _, _, rasteriser = sound_machine
     monkeypatch.setattr(select, "list_devices", lambda: [cpu, rasteriser])
-    assert select.explain_choice() == "before 4: GPUs come before accelerators, CPUs and software"
+    assert select.explain_choice() == f"before {RASTERISER}: GPUs come before accelerators, CPUs and software"
 
 
 def test_device_with_a_remembered_fault_is_no_other_one_in_the_explanation(machine, monkeypatch):
@@ -211,7 +216,7 @@ H200_IS_WRONG = "H200 (NVIDIA CUDA) is not used, it computes wrongly: 7 of 9 ver
 @pytest.fixture
 def faulty_h200(machine):
     """The machine, whose H200 has failed the check at first use."""
-    machine[3].fault = "7 of 9 vertices of a ball lie beside it"
+    machine[H200].fault = "7 of 9 vertices of a ball lie beside it"
     return machine
 
 
@@ -228,12 +233,12 @@ def test_device_that_computes_wrongly_is_chosen_by_what_does_not_check_devices(f
 
 
 @pytest.mark.fault_row(57)
-@pytest.mark.parametrize("wanted", ["h200", "gpu", 3])
+@pytest.mark.parametrize("wanted", ["h200", "gpu", H200])
 def test_device_that_computes_wrongly_is_refused_when_it_or_its_type_is_named(faulty_h200, wanted):
     words = f"^{re.escape(H200_IS_WRONG)}: update its driver or choose another"
     with pytest.raises(DeviceError, match=words) as caught:
         choose_device(wanted)
-    assert caught.value.exit_code == 5
+    assert caught.value.exit_code == 5  # devices, see docs/contract.md
 
 
 @pytest.mark.fault_row(57)
@@ -289,14 +294,10 @@ def test_error_without_a_device_names_the_limit_of_memory_of_the_process(monkeyp
         choose_device()
 
 
-MIB = 2**20
-"""Messages about buffers count in MiB."""
-
-
 @pytest.fixture
 def cpu(machine):
-    """The CPU of the machine: 32,768 MiB of memory, 8,192 MiB in one buffer."""
-    return machine[1]
+    """The CPU of the machine: 32,768 MiB of memory, 8,192 MiB in one buffer; messages count in MiB."""
+    return machine[CPU]
 
 
 def test_bytes_of_buffers_within_the_budget_are_added_up(cpu):
@@ -318,23 +319,23 @@ def test_buffers_larger_than_the_device_together_are_refused_with_their_sum(cpu)
 
 def test_buffers_larger_than_the_allowed_memory_together_are_refused_with_the_limit(cpu):
     with refused(DeviceError, 2, 1, 524288, 1000000):  # MiB, rounded up and down, and bytes of the picture and allowed
-        check_budget(cpu, {"volume": 1 * MIB, "picture": MIB // 2}, 1_000_000)
+        check_budget(cpu, {"volume": 1 * MIB, "picture": MIB // 2}, memory=1_000_000)
 
 
 def test_buffer_larger_than_the_allowed_memory_is_refused(cpu):
     with refused(DeviceError, "volume", 4, 1, "MiB"):
-        check_budget(cpu, {"volume": 4 * MIB}, 1 * MIB)
+        check_budget(cpu, {"volume": 4 * MIB}, memory=1 * MIB)
 
 
 def test_buffers_within_the_allowed_memory_are_accepted(cpu):
-    assert check_budget(cpu, {"volume": 1 * MIB, "picture": MIB // 2}, 2 * MIB) == 3 * MIB // 2
+    assert check_budget(cpu, {"volume": 1 * MIB, "picture": MIB // 2}, memory=2 * MIB) == 3 * MIB // 2
 
 
 @pytest.mark.parametrize("allowed_bytes", [10**6, 2**36])
 def test_buffers_larger_than_the_device_are_refused_with_its_memory_whatever_is_allowed(cpu, allowed_bytes):
     """To allow more would not help."""
     with refused(DeviceError, 32768, "MiB"):
-        check_budget(cpu, FIVE_LARGE_BUFFERS, allowed_bytes)
+        check_budget(cpu, FIVE_LARGE_BUFFERS, memory=allowed_bytes)
 
 
 def test_devices_of_this_machine_are_numbered_in_their_order():

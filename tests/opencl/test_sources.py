@@ -94,4 +94,4 @@ def test_installation_without_kernels_is_refused_as_damaged(tmp_path, monkeypatc
     monkeypatch.setattr(sources.resources, "files", lambda name: tmp_path)
     with refused(DeviceError, "volume.h", "kernels") as caught:
         sources.kernel_root.__wrapped__()
-    assert caught.value.exit_code == 5
+    assert caught.value.exit_code == 5  # devices, see docs/contract.md

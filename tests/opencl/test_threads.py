@@ -19,13 +19,14 @@ def test_surfaces_extracted_by_several_threads_are_those_of_one_thread(device):
         Volume(np.random.default_rng(seed).integers(0, 6, (4 + seed, 5, 20 + 7 * seed)).astype(np.int16), np.eye(4))
         for seed in range(4)
     ]
-    expected_meshes = [extract_isosurface(volume, 3, device=device) for volume in volumes]
+    middle = 3  # of the values 0 to 5
+    expected_meshes = [extract_isosurface(volume, middle, device=device) for volume in volumes]
     repeats = 15
     interval = sys.getswitchinterval()
     sys.setswitchinterval(1e-6)
     try:
         with ThreadPoolExecutor(4) as pool:
-            meshes = list(pool.map(lambda volume: extract_isosurface(volume, 3, device=device), repeats * volumes))
+            meshes = list(pool.map(lambda volume: extract_isosurface(volume, middle, device=device), repeats * volumes))
     finally:
         sys.setswitchinterval(interval)
 

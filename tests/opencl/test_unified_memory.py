@@ -50,7 +50,7 @@ def test_surface_on_a_gpu_of_the_processor_has_the_same_bytes_and_uploads_no_vol
     with counting_calls() as counts:
         mesh = surface_bytes(volume, unified_gpu)
     assert mesh == surface_bytes(volume, device)
-    assert counts["uploads, bytes"] < volume.voxels.nbytes / 100  # tables alone
+    assert counts["uploads, bytes"] < volume.voxels.nbytes / 100  # tables alone: measured 9,568 bytes, a 219th
 
 
 def test_volume_is_uploaded_where_the_driver_copies_the_arrays_of_the_host(unified_gpu, monkeypatch):
@@ -156,6 +156,6 @@ def test_surface_on_rusticl_as_a_gpu_uploads_no_volume():
     kind, lanes, counts = json.loads(run.stdout)
     assert (kind, lanes) == ("gpu", "1")
     volume_bytes = 32 * 256 * 256 * 2
-    assert counts["uploads, bytes"] < volume_bytes / 256  # tables alone
+    assert counts["uploads, bytes"] < volume_bytes / 256  # tables alone: measured 4,960 bytes, an 846th
     assert counts["blocking reads"] == 2  # the totals, then the arrays
     assert counts.get("allocations", 0) == 0

@@ -116,9 +116,10 @@ def test_name_of_the_cpu_that_another_device_object_has_written_is_found_and_wri
 @linux_only
 def test_name_with_two_pointers_behind_the_target_is_found():
     structure = DriverStructure(TARGET, UNKNOWN)
-    structure.words[100:102] = structure.words[4:6]
+    structure.words[100:102] = structure.words[4:6]  # the pointers to the target and to the name
     NameOfCpu(structure.address).write()
-    assert structure.texts[1] != UNKNOWN
+    _, name = structure.texts
+    assert name != UNKNOWN
 
 
 @linux_only
@@ -146,10 +147,11 @@ def test_address_without_memory_is_refused_and_does_not_end_the_process():
 def test_name_that_changed_after_it_was_found_is_not_overwritten():
     structure = DriverStructure(TARGET, UNKNOWN)
     cpu = NameOfCpu(structure.address)
-    structure.strings[1].value = b"znver5"
+    _, name = structure.strings
+    name.value = b"znver5"
     with refused(LookupError, "changed"):
         cpu.write()
-    assert structure.texts[1] == b"znver5"
+    assert structure.texts == [TARGET, b"znver5"]
 
 
 def pocl_device_on_unknown_cpu(device: Device, address: int) -> Device:
@@ -188,14 +190,14 @@ def cpu_structure(monkeypatch):
 def test_name_of_the_cpu_is_written_when_the_device_is_opened_and_is_a_build_option(device, cpu_structure, monkeypatch):
     named = pocl_device_on_unknown_cpu(device, cpu_structure.address)
     assert named.shortcoming == ""
-    assert cpu_structure.texts[1] == UNKNOWN  # not opened yet
-    names_when_opened = []
-    monkeypatch.setattr("pyopencl.Context", lambda devices: names_when_opened.append(cpu_structure.texts[1].decode()))
+    assert cpu_structure.texts == [TARGET, UNKNOWN]  # not opened yet
+    texts_when_opened = []
+    monkeypatch.setattr("pyopencl.Context", lambda devices: texts_when_opened.append(cpu_structure.texts))
 
     assert named.context is None  # opens the device
 
-    [name] = names_when_opened
-    assert f"-DCPU_NAME={name}" in named.build_options
+    [(_, name)] = texts_when_opened
+    assert f"-DCPU_NAME={name.decode()}" in named.build_options
 
 
 @linux_only
@@ -204,7 +206,8 @@ def test_device_is_refused_when_another_name_of_its_cpu_was_written_before_it_is
 ):
     monkeypatch.setattr("pyopencl.Context", lambda devices: None)
     named = pocl_device_on_unknown_cpu(device, cpu_structure.address)
-    cpu_structure.strings[1].value = b"znver5"
+    _, name = cpu_structure.strings
+    name.value = b"znver5"
     with refused(DeviceError, "CPU"):
         _ = named.context
 

@@ -144,7 +144,7 @@ def test_kernel_over_the_time_limit_is_an_error_that_names_it_the_limit_and_how_
         device.commands.add(f"kernel {number}", event, QUEUE)
     with time_limit(0.2), refused(DeviceTimeoutError, "kernel", 1, 0.2) as caught:
         wait(device)
-    assert caught.value.exit_code == 5
+    assert caught.value.exit_code == 5  # devices, see docs/contract.md
     assert "(0: none)" in str(caught.value)
 
 
