@@ -23,16 +23,17 @@ TILTED = np.array([[0.6, 0.0, 0.9, -20.0], [0.0, 0.6, 0.7, 5.0], [0.0, 0.0, 2.0,
 """Slices are shifted sideways along both axes: rows of a ball are not centred."""
 
 
-def random_mask(shape: tuple[int, int, int], density: float, seed: int = 3) -> np.ndarray:
+def random_mask(shape: tuple[int, int, int], *, density: float, seed: int = 3) -> np.ndarray:
     return np.random.default_rng(seed).random(shape) < density
 
 
 def volume_of(shape: tuple[int, int, int], affine: np.ndarray | None) -> Volume:
+    """Voxels of 0 at the places of an affine; without one, slices that are unevenly spaced."""
     voxels = np.zeros(shape, np.int16)
     return uneven(voxels) if affine is None else Volume(voxels, affine)
 
 
-def assert_changes_equal_twin(device, volume: Volume, chosen: np.ndarray, mm: float, by_slice: bool = False) -> None:
+def assert_changes_equal_twin(device, volume: Volume, chosen: np.ndarray, *, mm: float, by_slice: bool = False) -> None:
     """Dilated, eroded, opened and closed by a ball of `mm`, the mask `chosen` is that of the twin, and itself stays."""
     mask = clrecon.Mask.from_array(volume, chosen, device=device)
     eroded = twin.erode(volume, chosen, mm, by_slice=by_slice)
@@ -53,34 +54,34 @@ FRAMES = {"fine": FINE, "oblique": OBLIQUE, "mirrored": MIRRORED, "tilted": TILT
 @pytest.mark.parametrize("affine", FRAMES.values(), ids=FRAMES.keys())
 @pytest.mark.parametrize(("mm", "density"), [(0.3, 0.5), (1.0, 0.03), (1.0, 0.9), (2.3, 0.01), (3.9, 0.997)])
 def test_random_masks_dilated_eroded_opened_and_closed_equal_the_twin(device, affine, mm, density):
-    chosen = random_mask((6, 9, 41), density)
-    assert_changes_equal_twin(device, volume_of(chosen.shape, affine), chosen, mm)
+    chosen = random_mask((6, 9, 41), density=density)
+    assert_changes_equal_twin(device, volume_of(chosen.shape, affine), chosen, mm=mm)
 
 
 @pytest.mark.every_device
 @pytest.mark.parametrize("ni", [1, 31, 32, 33, 512, 513, 2049])
 @pytest.mark.parametrize("affine", daily(1, [FINE, TILTED]), ids=["fine", "tilted"])
 def test_opening_and_closing_of_rows_of_every_length_equal_the_twin(device, ni, affine):
-    chosen = random_mask((3, 4, ni), 0.97)
-    assert_changes_equal_twin(device, volume_of(chosen.shape, affine), chosen, 1.5)
+    chosen = random_mask((3, 4, ni), density=0.97)
+    assert_changes_equal_twin(device, volume_of(chosen.shape, affine), chosen, mm=1.5)
 
 
 @pytest.mark.parametrize("shape", [(1, 9, 41), (1, 1, 41), (9, 1, 41), (7, 9, 1)])
 def test_opening_and_closing_of_flat_volumes_equal_the_twin(device, shape):
-    assert_changes_equal_twin(device, volume_of(shape, OBLIQUE), random_mask(shape, 0.8), 1.5)
+    assert_changes_equal_twin(device, volume_of(shape, OBLIQUE), random_mask(shape, density=0.8), mm=1.5)
 
 
 @pytest.mark.parametrize("affine", [FINE, TILTED, None], ids=["fine", "tilted", "uneven"])
 def test_opening_and_closing_slice_by_slice_equal_the_twin(device, affine):
-    chosen = random_mask((6, 9, 41), 0.9)
-    assert_changes_equal_twin(device, volume_of(chosen.shape, affine), chosen, 1.5, by_slice=True)
+    chosen = random_mask((6, 9, 41), density=0.9)
+    assert_changes_equal_twin(device, volume_of(chosen.shape, affine), chosen, mm=1.5, by_slice=True)
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0], ids=["empty", "full"])
 @pytest.mark.parametrize("affine", [FINE, TILTED, None], ids=["fine", "tilted", "uneven"])
 def test_empty_and_full_masks_dilated_eroded_opened_and_closed_equal_the_twin(device, affine, share):
     chosen = np.full((6, 9, 41), share == 1.0)
-    assert_changes_equal_twin(device, volume_of(chosen.shape, affine), chosen, 2.0)
+    assert_changes_equal_twin(device, volume_of(chosen.shape, affine), chosen, mm=2.0)
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0], ids=["empty", "full"])
@@ -92,7 +93,8 @@ def test_empty_and_full_masks_stay_when_closed(device, share):
 
 @pytest.fixture(params=FRAMES)
 def random_40_percent(request, device):
-    chosen = random_mask((6, 9, 41), 0.4)
+    """A mask of random voxels in one of `FRAMES`, whose voxels are 0.5 mm and more."""
+    chosen = random_mask((6, 9, 41), density=0.4)
     return clrecon.Mask.from_array(volume_of(chosen.shape, FRAMES[request.param]), chosen, device=device)
 
 
@@ -113,7 +115,7 @@ def test_opening_and_closing_of_long_rows_by_wide_balls_equal_the_twin(device, i
     volume = volume_of((1, 3, 700), np.diag((0.1, 5.0, 5.0, 1.0)))
     chosen = np.zeros((1, 3, 700), bool)
     chosen[0, 1, [40, 350, 351, 699]] = True
-    assert_changes_equal_twin(device, volume, ~chosen if inverted else chosen, 7.3)
+    assert_changes_equal_twin(device, volume, ~chosen if inverted else chosen, mm=7.3)
 
 
 LIMIT = 1 + 1e-6
@@ -123,7 +125,7 @@ LIMIT = 1 + 1e-6
 @pytest.mark.parametrize("shape", [(20, 33, 40), (9, 64, 65)])
 @pytest.mark.parametrize("mm", [0.6, 1.4, 3.0, 4.2, 6.1])
 def test_dilated_masks_hold_the_voxels_within_the_distance_of_scipy(device, shape, mm):
-    chosen = random_mask(shape, 0.002, seed=9)
+    chosen = random_mask(shape, density=0.002, seed=9)
     away = ndimage.distance_transform_edt(~chosen, sampling=(1.4, 0.6, 0.7))  # mm along k, j, i of FINE
     mask = clrecon.Mask.from_array(volume_of(shape, FINE), chosen, device=device)
     np.testing.assert_array_equal(mask.dilate(mm).to_numpy(), away <= mm * LIMIT)
@@ -132,7 +134,7 @@ def test_dilated_masks_hold_the_voxels_within_the_distance_of_scipy(device, shap
 @pytest.mark.parametrize("shape", [(20, 33, 40), (9, 64, 65)])
 @pytest.mark.parametrize("mm", [0.6, 1.4, 3.0, 4.2, 6.1])
 def test_eroded_masks_hold_the_voxels_deeper_than_the_distance_of_scipy(device, shape, mm):
-    chosen = ~random_mask(shape, 0.002, seed=9)
+    chosen = ~random_mask(shape, density=0.002, seed=9)
     outside_is_empty = np.pad(chosen, 1)
     deep = ndimage.distance_transform_edt(outside_is_empty, sampling=(1.4, 0.6, 0.7))[1:-1, 1:-1, 1:-1]
     mask = clrecon.Mask.from_array(volume_of(shape, FINE), chosen, device=device)
@@ -185,7 +187,7 @@ def test_rows_of_a_ball_beyond_the_volume_are_left_out_unless_the_whole_ball_is_
 @pytest.mark.parametrize("change", ["dilate", "erode", "open", "close"])
 @pytest.mark.parametrize("mm", [0.0, -1.0, math.nan, math.inf, "3", None, True])
 def test_radii_that_are_no_positive_number_are_refused(device, mm, change):
-    mask = clrecon.Mask.from_array(volume_of((3, 4, 33), FINE), random_mask((3, 4, 33), 0.5), device=device)
+    mask = clrecon.Mask.from_array(volume_of((3, 4, 33), FINE), random_mask((3, 4, 33), density=0.5), device=device)
     with refused(UsageError, 0.0, "radius"):
         getattr(mask, change)(mm)
 
@@ -196,7 +198,8 @@ TALL = Volume(np.zeros((200, 1000, 33), np.int8), np.diag((1.0, 0.01, 0.01, 1.0)
 def test_a_radius_of_a_thousand_voxels_is_refused(device):
     """In voxels of 1 x 0.01 x 0.01 mm: hours of work."""
     mask = clrecon.Mask.from_band(TALL, (0, 1), device=device)
-    with refused(UsageError, "radius", 1e11):
+    most_visits = 1e11
+    with refused(UsageError, "radius", most_visits):
         mask.dilate(10.0)
 
 

@@ -25,7 +25,7 @@ SHAPE = (70, 3, 5)  # three words hold the 70 voxels of a row
 ROWS = 3 * 5
 
 
-@pytest.mark.parametrize(("pad", "words"), [(0, 3), (1, 4)])
+@pytest.mark.parametrize(("pad", "words"), [(0, 3), (1, 3 + 1)])  # `pad` is a word more at the end of each row
 def test_bytes_of_a_mask_are_those_of_its_words_and_of_the_extents_of_its_rows(pad, words):
     assert mask_bytes(SHAPE, pad) == {"mask of the voxels": 4 * words * ROWS, "row extents": 4 * ROWS}
 

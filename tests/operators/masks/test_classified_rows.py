@@ -40,7 +40,7 @@ def test_inside_bits_and_extents_of_rows_equal_those_of_numpy(device_as_gpu, col
     volume.voxels[1, 2] = 0  # a row without bits
     volume.voxels[0, :, -1] = 99  # rows whose last bit is set
     grid = SampleGrid(volume, choose_iso_rule(volume, 60, closed=closed))
-    slab = Slab(grid, 0, 3 + 2 * closed)  # a closed surface has a slice more at either end
+    slab = Slab(grid, first=0, end=3 + 2 * closed)  # a closed surface has a slice more at either end
     level = np.dtype(dtype).type(grid.rule.lowest_inside)
 
     made = classify(device_as_gpu, slab, upload(device_as_gpu, volume.voxels), [level])

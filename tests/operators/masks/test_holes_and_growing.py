@@ -17,8 +17,8 @@ from clrecon.geometry import Volume
 from clrecon.proof.volumes import volume_twins as twin
 
 
-def random_mask(shape: tuple[int, int, int], density: float, seed: int = 3) -> np.ndarray:
-    return np.random.default_rng(seed).random(shape) < density
+def random_mask(shape: tuple[int, int, int], *, density: float) -> np.ndarray:
+    return np.random.default_rng(3).random(shape) < density
 
 
 def mask_of(device, chosen: np.ndarray) -> clrecon.Mask:
@@ -28,7 +28,7 @@ def mask_of(device, chosen: np.ndarray) -> clrecon.Mask:
 @pytest.mark.parametrize("density", [0.0, 0.3, 0.6, 0.8, 1.0])
 @pytest.mark.parametrize("shape", [(7, 12, 40), (1, 12, 40), (7, 1, 40), (7, 12, 1), (1, 1, 1)])
 def test_filled_holes_of_random_masks_equal_the_twin_and_scipy(device, shape, density):
-    chosen = random_mask(shape, density)
+    chosen = random_mask(shape, density=density)
     filled = mask_of(device, chosen).fill_holes().to_numpy()
     np.testing.assert_array_equal(filled, twin.fill_holes(chosen))
     np.testing.assert_array_equal(filled, ndimage.binary_fill_holes(chosen))
@@ -37,14 +37,14 @@ def test_filled_holes_of_random_masks_equal_the_twin_and_scipy(device, shape, de
 @pytest.mark.parametrize("density", [0.0, 0.3, 0.6, 0.8, 1.0])
 @pytest.mark.parametrize("shape", [(7, 12, 40), (1, 12, 40), (7, 1, 40), (7, 12, 1), (1, 1, 1)])
 def test_holes_filled_slice_by_slice_equal_the_twin_and_scipy(device, shape, density):
-    chosen = random_mask(shape, density)
+    chosen = random_mask(shape, density=density)
     filled = mask_of(device, chosen).fill_holes(by_slice=True).to_numpy()
     np.testing.assert_array_equal(filled, twin.fill_holes(chosen, by_slice=True))
     np.testing.assert_array_equal(filled, np.stack([ndimage.binary_fill_holes(layer) for layer in chosen]))
 
 
 def test_filling_holes_leaves_the_mask_itself(device):
-    chosen = random_mask((7, 12, 40), 0.8)
+    chosen = random_mask((7, 12, 40), density=0.8)
     mask = mask_of(device, chosen)
     assert mask.fill_holes().count > mask.count
     np.testing.assert_array_equal(mask.to_numpy(), chosen)
@@ -53,14 +53,14 @@ def test_filling_holes_leaves_the_mask_itself(device):
 @pytest.mark.every_device
 @pytest.mark.parametrize("columns", daily(4, [31, 32, 33, 512, 513, 2049]))
 def test_filled_holes_of_rows_of_every_length_equal_scipy(device, columns):
-    chosen = random_mask((4, 9, columns), 0.62)
+    chosen = random_mask((4, 9, columns), density=0.62)
     np.testing.assert_array_equal(mask_of(device, chosen).fill_holes().to_numpy(), ndimage.binary_fill_holes(chosen))
 
 
 @pytest.mark.every_device
 @pytest.mark.parametrize("columns", daily(4, [31, 32, 33, 512, 513, 2049]))
 def test_growth_in_rows_of_every_length_equals_the_twin(device, columns):
-    chosen = random_mask((4, 9, columns), 0.62)
+    chosen = random_mask((4, 9, columns), density=0.62)
     mask = mask_of(device, chosen)
     seeds = np.argwhere(chosen)[[0, -1]]
     grown = mask.grow(mask.scan.ijk_to_lps(seeds[:, ::-1]))
@@ -79,13 +79,14 @@ def test_holes_of_a_chess_board_are_filled_except_at_its_border(device):
 
 def test_seeds_on_a_chess_board_grow_to_themselves_alone(device):
     mask = mask_of(device, CHESS_BOARD)
-    assert mask.grow(mask.scan.ijk_to_lps([[2, 2, 2], [5, 4, 3]])).count == 2
+    two_seeds = [[2, 2, 2], [5, 4, 3]]  # their sums are even: both are chosen
+    assert mask.grow(mask.scan.ijk_to_lps(two_seeds)).count == 2
 
 
 @pytest.mark.parametrize("density", [0.4, 0.7])
 def test_filled_holes_of_random_masks_equal_the_package_fill_voids(device, density):
     fill_voids = pytest.importorskip("fill_voids")
-    chosen = random_mask((20, 33, 65), density)
+    chosen = random_mask((20, 33, 65), density=density)
     expected = fill_voids.fill(np.asfortranarray(chosen)).astype(bool)
     np.testing.assert_array_equal(mask_of(device, chosen).fill_holes().to_numpy(), expected)
 
@@ -112,7 +113,7 @@ def test_a_shell_with_a_hole_through_its_wall_is_filled_slice_by_slice_alone(dev
 
 @pytest.mark.parametrize("density", [0.25, 0.33, 0.5])
 def test_growth_from_points_gives_the_components_of_scipy_that_hold_them(device, density):
-    chosen = random_mask((9, 20, 70), density)
+    chosen = random_mask((9, 20, 70), density=density)
     labels, _ = ndimage.label(chosen)
     seeds = np.argwhere(chosen)[[0, 40, -1]]
     mask = mask_of(device, chosen)
@@ -122,7 +123,7 @@ def test_growth_from_points_gives_the_components_of_scipy_that_hold_them(device,
 
 
 def test_growth_from_points_beside_voxels_of_an_uneven_stack_equals_the_twin(device):
-    volume = uneven(random_mask((6, 9, 40), 0.4).astype(np.int16))
+    volume = uneven(random_mask((6, 9, 40), density=0.4).astype(np.int16))
     chosen = volume.voxels > 0
     seeds = np.argwhere(chosen)[[3, -5]]
     beside = volume.ijk_to_lps(seeds[:, ::-1]) + 0.05  # mm: the nearest voxels are the same
@@ -170,7 +171,7 @@ CUBE = Volume(np.arange(27, dtype=np.int16).reshape(3, 3, 3), np.eye(4))
 
 
 def test_volume_takes_one_point_for_an_array_of_one():
-    assert CUBE.sample(POINT) == CUBE.sample([POINT])[0]
+    assert [CUBE.sample(POINT)] == CUBE.sample([POINT]).tolist()
     assert CUBE.lps_to_ijk(POINT).tolist() == [1, 1, 1]
 
 
@@ -180,16 +181,17 @@ def test_cloud_is_made_of_one_point():
 
 def test_mask_grows_from_one_point_and_lies_in_a_ball_around_it(device):
     mask = clrecon.Mask.from_band(CUBE, (0, None), device=device)
-    assert mask.grow(POINT).count == 27
-    assert clrecon.Mask.from_tube(CUBE, POINT, 9.0, device=device).count == 27
+    assert mask.grow(POINT).count == CUBE.voxels.size
+    assert clrecon.Mask.from_tube(CUBE, POINT, 9.0, device=device).count == CUBE.voxels.size  # a ball of 9 mm
 
 
 def test_mesh_takes_one_point_for_an_array_of_one():
     box = clrecon.Mesh(*samples.box())
     (part,) = box.split(seeds=POINT)
     assert part.vertices.tolist() == box.vertices.tolist()
-    assert box.closest_points(POINT)[1].shape == (1,)
-    assert box.ray(POINT, (0, 0, 1))[:, 0].shape == (1,)
+    points, distances, rows = box.closest_points(POINT)
+    assert (points.shape, distances.shape, rows.shape) == ((1, 3), (1,), (1,))
+    assert box.ray(POINT, (0, 0, 1)).shape == (1, 3)
 
 
 def test_clip_takes_one_point_for_an_array_of_one():

@@ -36,7 +36,7 @@ def volume_of_grid(grid: str) -> Volume:
         case "uneven":
             return uneven(noise)
         case "uneven, mirrored":
-            return uneven(noise, -1.0)
+            return uneven(noise, sign=-1.0)
         case "one slice":
             return Volume(noise[:1], OBLIQUE)
     return Volume(noise, {"straight": np.eye(4), "oblique": OBLIQUE, "mirrored": MIRRORED, "tilted": TILTED}[grid])
@@ -67,6 +67,7 @@ def test_mask_of_a_band_without_an_end_holds_the_voxels_from_its_lower_value_on(
 
 @pytest.fixture
 def two_masks(device):
+    """Masks of the voxels above 40 of random HU from 0 to 99, and of those that are multiples of three."""
     volume = random_volume((5, 6, 70), high=100)
     chosen = volume.voxels > 40, volume.voxels % 3 == 0
     return [clrecon.Mask.from_array(volume, bits, device=device) for bits in chosen]
@@ -97,7 +98,8 @@ def test_difference_of_masks_is_named_by_both(two_masks):
 
 def test_mask_and_an_array_are_not_joined(two_masks):
     with refused(TypeError, "Mask"):
-        two_masks[0] & two_masks[1].to_numpy()
+        one, other = two_masks
+        one & other.to_numpy()
 
 
 @pytest.mark.parametrize("grid", GRIDS)
@@ -148,7 +150,7 @@ def test_a_tube_of_ten_metres_around_a_voxel_holds_all(device, grid):
 @pytest.fixture
 def labelled():
     """A volume, and a label map of the numbers 0 to 5 in which 2 is named L1 and 3 L2."""
-    volume = random_volume((4, 5, 40))
+    volume = random_volume((4, 5, 40), high=6)
     return volume, LabelMap(volume.voxels.astype(np.uint8), volume.affine, {2: "L1", 3: "L2"})
 
 
@@ -227,7 +229,8 @@ def test_surface_of_the_voxels_in_a_box_is_that_of_the_volume_with_air_elsewhere
     assert 0 < len(found.triangles) < len(whole.triangles)
 
 
-SMALL = random_volume((3, 4, 40))
+SMALL = random_volume((3, 4, 40), high=6)
+"""Random HU from 0 to 5."""
 
 
 def test_mask_of_a_band_whose_ends_are_exchanged_is_refused(device):
@@ -290,6 +293,7 @@ def test_mask_of_a_tube_beside_the_volume_is_refused_with_the_corners_of_the_vol
 
 @pytest.fixture
 def small_mask(device):
+    """The voxels of `SMALL` from 1 to 3 HU."""
     return Mask.from_band(SMALL, (1, 3), device=device)
 
 
@@ -315,7 +319,7 @@ def test_mask_is_neither_pickled_nor_copied(small_mask, duplicate):
         duplicate(small_mask)
 
 
-WIDE = random_volume((40, 50, 600))
+WIDE = random_volume((40, 50, 600), high=6)
 ONE_MASK = 40 * 50 * 19 * 4  # bytes of 19 words a row: 152,000
 ROOM_FOR_TWO_MASKS = 400_000  # bytes; the voxels alone take 2,400,000
 
@@ -345,6 +349,7 @@ def test_mask_of_an_array_without_room_is_refused(device):
 
 @pytest.fixture
 def small_random_mask(device):
+    """Two fifths of the voxels of an oblique volume of 0 HU."""
     chosen = np.random.default_rng(3).random((5, 6, 41)) < 0.4
     return clrecon.Mask.from_array(Volume(np.zeros((5, 6, 41), np.int16), OBLIQUE), chosen, device=device)
 
@@ -456,7 +461,8 @@ def test_the_surface_of_a_mask_is_that_of_its_label_and_has_its_volume(device):
     chosen[4:15, 5:20, 6:33] = True
     mask = clrecon.Mask.from_array(volume, chosen, device=device)
     mesh = mask.to_mesh()
-    expected = clrecon.extract_label_masks(mask.to_label_map(), device=device)[1]
+    mesh_of_label = clrecon.extract_label_masks(mask.to_label_map(), device=device)
+    expected = mesh_of_label[1]
     np.testing.assert_array_equal(mesh.vertices, expected.vertices)
     assert mesh.volume / 1000.0 == pytest.approx(mask.ml, rel=MASK_VOLUME)
 
@@ -511,7 +517,7 @@ def test_labels_and_a_mask_of_other_slice_gaps_are_refused(device: Any) -> None:
 
 
 def test_labels_and_a_mask_of_fewer_slices_are_refused(device: Any) -> None:
-    with refused(UsageError, 5, 4, 2):
+    with refused(UsageError, 5, 4, 2):  # columns, rows and slices of the volume
         ONES_OF_1_MM - Mask.from_band(ONES_OF_2_MM[:2], (0, None), device=device)
 
 
