@@ -17,23 +17,24 @@ from clrecon.proof.points import neighbours as twin
 from clrecon.proof.points.neighbours import find_neighbours, mean_distances, principal_axes
 
 
-def filter_by_twin(points, k=16, factor=2.0, features=None):
+def filter_by_twin(points, *, k=16, factor=2.0, features=None):
+    """Return the points that `denoise_points` has to give with the same parameters, shape (n, 3)."""
     indices, distances = find_neighbours(points, k)
     axes, eigenvalues = principal_axes(points, indices)
     scales = twin.filter_scales(points, axes, indices, factor)
     factors = twin.bilateral_factors(points, axes, indices, *scales)
     if features is not None:
         edge = np.float32(2.0 * np.median(scales[0]))
-        made = grid_twin.make_grid(points, edge)
+        grid = grid_twin.make_grid(points, edge)
         cells = np.empty(len(points), np.int64)
-        counts = np.diff(made.starts.astype(np.int64))
-        cells[made.order] = np.repeat(np.arange(len(counts)), counts)
+        counts = np.diff(grid.starts.astype(np.int64))
+        cells[grid.order] = np.repeat(np.arange(len(counts)), counts)
         if features == "paper":
             ratios = distance_ratios(mean_distances(distances), distances[:, 1], cells)
-            kept = find_features(ratios, ratio_threshold(ratios))
+            is_feature = find_features(ratios, ratio_threshold(ratios))
         else:
-            kept = eigenvalues[:, 0] / eigenvalues.sum(axis=1) > VARIATION_OF_FEATURES
-        factors = np.where(kept, factors, twin.cell_factors(points, axes, cells, *scales))
+            is_feature = eigenvalues[:, 0] / eigenvalues.sum(axis=1) > VARIATION_OF_FEATURES
+        factors = np.where(is_feature, factors, twin.cell_factors(points, axes, cells, *scales))
     return points.astype(np.float64) - factors[:, None] * axes
 
 
@@ -42,11 +43,12 @@ def filter_by_twin(points, k=16, factor=2.0, features=None):
 ]))  # fmt: skip
 def test_filtered_points_equal_their_twin(device, shape, k, factor):
     points = shape().points
-    step = denoise_points(PointCloud(points), k, factor, device=device)
-    away = np.abs(step.cloud.points - filter_by_twin(points, k, factor)).max(axis=1)
+    step = denoise_points(PointCloud(points), k=k, range_factor=factor, device=device)
+    away = np.abs(step.cloud.points - filter_by_twin(points, k=k, factor=factor)).max(axis=1)
 
     # Where the two smaller eigenvalues are nearly equal, the normal is any direction of a plane.
-    _, eigenvalues = principal_axes(points, find_neighbours(points, k)[0])
+    indices, _ = find_neighbours(points, k)
+    _, eigenvalues = principal_axes(points, indices)
     has_normal = (eigenvalues[:, 1] - eigenvalues[:, 0]) / eigenvalues[:, 2] > 0.03
     assert has_normal.mean() > 0.97  # measured 1
     assert away[has_normal].max() < TWIN_FILTER_MM
@@ -54,7 +56,7 @@ def test_filtered_points_equal_their_twin(device, shape, k, factor):
 
 @pytest.mark.parametrize("features", ["paper", "variation"])
 def test_points_that_are_no_features_are_filtered_by_their_whole_cell_as_by_the_twin(device, features):
-    points = cube(12.0).points
+    points = cube(size=12.0).points
     step = denoise_points(PointCloud(points), features=features, device=device)
     expected = filter_by_twin(points, features=features)
     away = np.abs(step.cloud.points - expected).max(axis=1)
@@ -66,7 +68,7 @@ def test_points_that_are_no_features_are_filtered_by_their_whole_cell_as_by_the_
 
 
 def test_paper_mode_is_range_factor_one_with_the_features_of_the_paper(device):
-    points = sphere(8.0).points
+    points = sphere(radius=8.0).points
     paper = denoise_points(PointCloud(points), paper=True, device=device)
     same = denoise_points(PointCloud(points), range_factor=1.0, features="paper", device=device)
     assert np.array_equal(paper.cloud.points, same.cloud.points)
@@ -88,7 +90,7 @@ def test_filtered_points_lie_nearer_to_their_shape_than_the_noise_of_0p2_mm(devi
 @pytest.fixture(scope="module")
 def filtered_sphere(device):
     """A sphere of 8 mm with HU and normals, and what the filter makes of it."""
-    points = sphere(8.0).points
+    points = sphere(radius=8.0).points
     cloud = PointCloud(points, hu=np.arange(len(points)), normals=points)
     return cloud, denoise_points(cloud, device=device)
 
@@ -122,7 +124,7 @@ def test_three_passes_of_range_factor_one_leave_as_little_noise_as_one_of_two(de
 
 def test_points_of_a_tilted_plane_without_noise_stay(device):
     turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0].astype(np.float32)
-    step = denoise_points(PointCloud(plane(20.0).clean @ turn), device=device)
+    step = denoise_points(PointCloud(plane(size=20.0).clean @ turn), device=device)
     assert step.facts["largest_move_mm"] < FILTERED_PLANE_MM
 
 
@@ -130,13 +132,13 @@ def test_points_of_a_tilted_plane_without_noise_stay(device):
 def test_equal_points_and_points_of_a_line_stay(device, features):
     equal, line = np.zeros((40, 3)), np.outer(np.arange(40.0), [1, 1, 0])
     points = np.r_[equal, line].astype(np.float32)
-    step = denoise_points(PointCloud(points), 8, features=features, device=device)
+    step = denoise_points(PointCloud(points), k=8, features=features, device=device)
     assert np.array_equal(step.cloud.points, points)
 
 
 def test_shifted_cloud_is_filtered_alike_except_for_rounding(device):
     shift = 1e5
-    points = np.round(sphere(8.0).points.astype(np.float64), 3)
+    points = np.round(sphere(radius=8.0).points.astype(np.float64), 3)
     near = denoise_points(PointCloud(points), device=device).cloud.points
     far = denoise_points(PointCloud(points + shift), device=device).cloud.points
     assert far.dtype == np.float64
@@ -144,7 +146,7 @@ def test_shifted_cloud_is_filtered_alike_except_for_rounding(device):
 
 
 def test_permuted_points_give_permuted_results(device):
-    points = sphere(8.0).points
+    points = sphere(radius=8.0).points
     order = np.random.default_rng(0).permutation(len(points))
     straight = denoise_points(PointCloud(points), device=device).cloud.points
     permuted = denoise_points(PointCloud(points[order]), device=device).cloud.points
@@ -153,16 +155,16 @@ def test_permuted_points_give_permuted_results(device):
 
 def test_a_cloud_of_several_parts_is_filtered_as_its_twin(device):
     """A kernel takes a part of a large cloud at a time; devices without long work-items take larger parts."""
-    points = sphere(48.0 if device.has_long_items else 190.0).points
-    step = denoise_points(PointCloud(points), 8, device=device)
-    away = np.abs(step.cloud.points - filter_by_twin(points, 8))
+    points = sphere(radius=48.0 if device.has_long_items else 190.0).points
+    step = denoise_points(PointCloud(points), k=8, device=device)
+    away = np.abs(step.cloud.points - filter_by_twin(points, k=8))
     assert np.quantile(away, 0.999) < TWIN_FILTER_MM  # others have two nearly equal eigenvalues
 
 
 @pytest.mark.oclgrind
 def test_points_of_a_small_cloud_are_moved_less_than_a_millimetre(device):
-    points = sphere(3.0).points
-    step = denoise_points(PointCloud(points), 6, features="variation", device=device)
+    points = sphere(radius=3.0).points
+    step = denoise_points(PointCloud(points), k=6, features="variation", device=device)
     assert 0.01 < step.facts["rms_move_mm"] < 1.0  # noise of 0.2 mm
 
 

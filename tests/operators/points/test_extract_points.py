@@ -23,7 +23,9 @@ OBLIQUE = np.array([[0.7, 0.1, 0.05, -150.0], [-0.1, 0.5, 0.3, -30.0], [0.0, 0.0
 BAND = (20, 60)  # HU, of random values from 0 to 99
 
 
-def make_volume(shape: tuple[int, int, int], dtype: str = "int16", uneven: bool = False, far: bool = False) -> Volume:
+def make_volume(
+    shape: tuple[int, int, int], dtype: str = "int16", *, uneven: bool = False, far: bool = False
+) -> Volume:
     """Random HU from 0 to 99 in an oblique volume, some 20 m from the origin where it is `far`."""
     chance = np.random.default_rng(8)
     affine = OBLIQUE.copy()
@@ -166,15 +168,15 @@ def test_points_20_m_from_the_origin_are_float64_with_a_warning(device):
 
 @pytest.fixture(scope="module")
 def small_volume() -> Volume:
-    """Of 3 x 5 x 33 voxels, 495 in all."""
+    """Of 3 slices, 5 rows and 33 columns."""
     return make_volume((3, 5, 33))
 
 
 def test_report_of_points_of_the_whole_volume_counts_all_voxels(device, small_volume):
     cloud = extract_points(small_volume, hu=(0, None), device=device)
-    report = cloud.report
-    assert len(cloud) == 495
-    assert (report["voxels"], report["points"], report["voxels_in_band"]) == (495, 495, 495)
+    report, voxels = cloud.report, small_volume.voxels.size
+    assert len(cloud) == voxels
+    assert (report["voxels"], report["points"], report["voxels_in_band"]) == (voxels, voxels, voxels)
     assert report["share"] == 1.0
 
 
@@ -199,25 +201,28 @@ def test_band_without_a_lower_end_holds_all_voxels_up_to_its_upper_end(device, s
 def test_shell_of_the_whole_volume_is_what_its_inner_voxels_leave(device, small_volume):
     inner = (3 - 2) * (5 - 2) * (33 - 2)
     shell = extract_points(small_volume, 0, kind="shell", device=device)
-    assert len(shell) == 495 - inner
-    assert shell.report["voxels_in_band"] == 495
+    assert len(shell) == small_volume.voxels.size - inner
+    assert shell.report["voxels_in_band"] == small_volume.voxels.size
 
 
-@pytest.mark.parametrize(("high", "points"), [(-1, 0), (99, 495)], ids=["no point", "all voxels"])
+@pytest.mark.parametrize(("high", "points"), [(-1, 0), (99, 3 * 5 * 33)], ids=["no point", "all voxels"])
 def test_bytes_of_point_extraction_are_those_of_its_buffers(device, high, points):
     volume = Volume(np.zeros((3, 5, 33), np.int16), np.eye(4))
-    emission = VoxelEmission(DeviceVolume(volume, device=device), Selection(np.int16(-5), np.int16(high)))
-    assert len(emission.run()[1]) == points
+    selection = Selection(low=np.int16(-5), high=np.int16(high))
+    emission = VoxelEmission(DeviceVolume(volume, device=device), selection)
+    _, hu, _ = emission.run()
+    assert len(hu) == points
 
     rows, point_bytes = 3 * 5, 3 * 4 + 4 + 4  # place, HU and number of a point
     mask, end, counts = 2 * 4, 4, 9  # of each row: two words for 33 columns, where its points begin, and counts
     assert emission.largest == {
-        "volume": 2 * 495, "output": point_bytes * points, "scratch": rows * (mask + end + counts)
+        "volume": volume.voxels.nbytes, "output": point_bytes * points, "scratch": rows * (mask + end + counts)
     }  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def uneven_volume() -> Volume:
+    """Random HU from 0 to 99 in 9 slices with gaps of 0.4 to 7 mm."""
     return make_volume((9, 10, 40), uneven=True)
 
 
@@ -271,7 +276,7 @@ def test_surface_points_of_a_named_label_are_the_vertices_of_its_mesh(device):
     volume = make_volume((8, 12, 40))
     labels = three_bones(volume)
     cloud = extract_points(volume, 50, labels=labels, label="bone", device=device)
-    mesh = extract_labels(volume, labels, 50, label=["bone"], device=device)[1]
+    (mesh,) = extract_labels(volume, labels, 50, label=["bone"], device=device).values()
     np.testing.assert_array_equal(cloud.points, mesh.vertices)
     assert set(cloud.labels.tolist()) == {1}
     assert cloud.report["label_name"] == "bone"
@@ -395,21 +400,24 @@ def test_twin_marks_the_border_of_a_full_volume_as_its_shell():
     assert mark_shell(np.ones((3, 4, 5), bool)).sum() == 3 * 4 * 5 - 1 * 2 * 3
 
 
+OUTER_MM = 13.0
+
+
 @pytest.fixture(scope="module")
 def hollow_bone() -> Volume:
-    """A blurred shell of bone, 3 mm thick, whose outer radius is 13 mm."""
-    return hollow_ball(thickness=3.0)
+    """A blurred shell of bone whose inner radius is 10 mm."""
+    return hollow_ball(radius=OUTER_MM, thickness=3.0)
 
 
 def outer_points(cloud) -> np.ndarray:
-    """Which points lie on the outer wall of `hollow_bone`: its inner radius is 10 mm."""
-    return np.linalg.norm(cloud.points - MIDDLE, axis=1) > 12.5
+    """Which points lie on the outer wall of `hollow_bone`."""
+    return np.linalg.norm(cloud.points - MIDDLE, axis=1) > OUTER_MM - 0.5
 
 
 def test_points_of_the_cortex_lie_on_the_bone_and_those_of_a_level_outside(device, hollow_bone):
     level, cortex = (extract_points(hollow_bone, 200.0, kind=kind, device=device) for kind in ("surface", "cortex"))
     away_of_level, away_of_cortex = (
-        np.linalg.norm(cloud.points[outer_points(level)] - MIDDLE, axis=1) - 13.0 for cloud in (level, cortex)
+        np.linalg.norm(cloud.points[outer_points(level)] - MIDDLE, axis=1) - OUTER_MM for cloud in (level, cortex)
     )
     assert away_of_level.mean() == pytest.approx(0.76, abs=0.01)  # measured: 200 HU is reached far out in the blur
     assert np.abs(away_of_cortex).mean() < 0.025  # measured 0.016

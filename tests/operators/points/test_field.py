@@ -17,16 +17,17 @@ from clrecon.points import PointCloud
 from clrecon.proof.points import field as twin
 
 
-def scattered_cloud(n, size=(9.0, 7.0, 8.0), seed=3):
-    rng = np.random.default_rng(seed)
+def scattered_cloud(n):
+    """Random points in a box of 9 x 7 x 8 mm, with random normals."""
+    rng = np.random.default_rng(3)
     normals = rng.normal(size=(n, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return PointCloud((rng.random((n, 3)) - 0.5) * size, normals)
+    return PointCloud((rng.random((n, 3)) - 0.5) * (9.0, 7.0, 8.0), normals)
 
 
-def assert_field_equals_twin(device, cloud, settings, **options):
-    """Compare every step with the twin; return the volume."""
-    field = NodeField(device, cloud, cloud.normals, settings, **options)
+def assert_field_equals_twin(device, cloud, settings):
+    """The masks, the signs and the volume of a field are those of the twin."""
+    field = NodeField(device, cloud, cloud.normals, settings)
     expected, near, core = twin_field(cloud, field.nodes, settings)
     found_near, found_core, negative = fetch_masks(field.masks)
     np.testing.assert_array_equal(found_near, near)
@@ -44,10 +45,9 @@ def assert_field_equals_twin(device, cloud, settings, **options):
     filled = twin.fill_nodes(expected, near, decided, far, 1e-6 * settings.spacing)
     np.testing.assert_allclose(volume, filled, atol=TWIN_FIELD_MM, rtol=0.0)
     np.testing.assert_array_equal(volume > 0.0, decided.inside)
-    return volume
 
 
-def settings_of_spacing(spacing, reach=2.0, smoothing=0.1, bridge=2.0):
+def settings_of_spacing(spacing, *, reach=2.0, smoothing=0.1, bridge=2.0):
     """Lengths of a field in mm from shares of its spacing."""
     return FieldSettings(spacing, reach * spacing, smoothing * spacing, bridge * spacing)
 
@@ -56,7 +56,8 @@ def settings_of_spacing(spacing, reach=2.0, smoothing=0.1, bridge=2.0):
     ("reach", "smoothing", "bridge"), [(2.0, 0.1, 2.0), (3.0, 1000.0, 1.5), (4.0, 1.0, 1.0), (2.6, 0.1, 2.5)]
 )
 def test_field_of_a_sphere_equals_the_twin(device, reach, smoothing, bridge):
-    assert_field_equals_twin(device, sphere_cloud(700, 4.0), settings_of_spacing(0.6, reach, smoothing, bridge))
+    settings = settings_of_spacing(0.6, reach=reach, smoothing=smoothing, bridge=bridge)
+    assert_field_equals_twin(device, sphere_cloud(700, radius=4.0), settings)
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 60, 255, 256, 257, 1000])
@@ -66,7 +67,7 @@ def test_field_of_points_with_random_normals_equals_the_twin(device, n):
 
 @pytest.mark.oclgrind
 def test_small_field_of_every_kernel_equals_the_twin(device):
-    assert_field_equals_twin(device, sphere_cloud(150, 2.5), settings_of_spacing(0.9))
+    assert_field_equals_twin(device, sphere_cloud(150, radius=2.5), settings_of_spacing(0.9))
 
 
 def test_a_point_at_the_end_of_its_cell_reaches_the_first_nodes_of_the_next_brick(device):
@@ -88,15 +89,16 @@ def test_a_point_at_the_end_of_its_cell_reaches_the_first_nodes_of_the_next_bric
 
 def test_field_around_600_points_in_one_place_equals_the_twin(device):
     """The kernel gathers 256 points of a brick at a time."""
-    points = np.concatenate([np.full((600, 3), (0.3, 0.1, -0.2)), sphere_cloud(300, 3.0).points])
-    normals = np.concatenate([np.tile((0.0, 0.6, 0.8), (600, 1)), sphere_cloud(300, 3.0).normals])
+    sphere = sphere_cloud(300, radius=3.0)
+    points = np.concatenate([np.full((600, 3), (0.3, 0.1, -0.2)), sphere.points])
+    normals = np.concatenate([np.tile((0.0, 0.6, 0.8), (600, 1)), sphere.normals])
     assert_field_equals_twin(device, PointCloud(points, normals), settings_of_spacing(0.7))
 
 
 @pytest.mark.parametrize("length", [6.1, 6.2, 14.2, 25.0])
 def test_field_of_nodes_around_whole_bricks_and_words_equals_the_twin(device, length):
     """Nodes along x on both sides of a brick of 8 and of a word of 32."""
-    cloud = cube_cloud(500, 2.0)
+    cloud = cube_cloud(500, edge=2.0)
     stretched = PointCloud(cloud.points * (length, 1.0, 1.0), cloud.normals)
     assert_field_equals_twin(device, stretched, settings_of_spacing(0.8, bridge=1.25))
 
@@ -119,6 +121,7 @@ def test_signs_of_random_masks_equal_the_twin(device, seed, share_near, rounds):
 
 
 def put_masks(device, *arrays):
+    """The masks near, core and negative on the device, from arrays (nz, ny, nx)."""
     masks = Masks(device, arrays[0].shape[::-1])
     for name, array in zip(("near_d", "core_d", "negative_d"), arrays, strict=True):
         padded = np.zeros((*array.shape[:2], 32 * masks.words), dtype=bool)
@@ -137,7 +140,7 @@ def write(device, to_d, from_d, size):
 
 
 def test_slabs_give_the_same_field_bit_for_bit(device):
-    cloud, settings = sphere_cloud(3000, 12.0), settings_of_spacing(0.5)
+    cloud, settings = sphere_cloud(3000, radius=12.0), settings_of_spacing(0.5)
     whole = NodeField(device, cloud, cloud.normals, settings)
     assert len(whole.slabs) == 1
     expected = whole.fill(decide_signs(whole.masks, whole.limits, settings.rounds))
@@ -151,7 +154,7 @@ def test_slabs_give_the_same_field_bit_for_bit(device):
 
 
 def test_memory_below_a_layer_of_bricks_is_refused_with_what_is_needed(device):
-    cloud = sphere_cloud(3000, 12.0)
+    cloud = sphere_cloud(3000, radius=12.0)
     with refused(DeviceMemoryError, "surface", "cloud", 200_000):
         NodeField(device, cloud, cloud.normals, settings_of_spacing(0.5), memory=200_000)
 
@@ -159,8 +162,8 @@ def test_memory_below_a_layer_of_bricks_is_refused_with_what_is_needed(device):
 @pytest.fixture(scope="module")
 def sphere_nodes():
     """A sphere of 5 mm, lengths of a field, and the nodes planned around it."""
-    cloud, settings = sphere_cloud(500, 5.0), settings_of_spacing(0.7, bridge=2.3)
-    return cloud, settings, plan_nodes(plan_grid(cloud, 1.4), settings)
+    cloud, settings = sphere_cloud(500, radius=5.0), settings_of_spacing(0.7, bridge=2.3)
+    return cloud, settings, plan_nodes(plan_grid(cloud, edge=1.4), settings)
 
 
 def test_nodes_reach_beyond_the_points_by_the_bridge_and_a_node(sphere_nodes):
@@ -182,10 +185,10 @@ FAR_CORNERS = np.array([(0, 0, 0), (900, 900, 900)], np.float32)
 
 def test_too_many_nodes_are_refused_with_the_most_allowed():
     with refused(UsageError, MOST_NODES, "nodes"):
-        plan_nodes(plan_grid(FAR_CORNERS, 1.0), settings_of_spacing(0.5))
+        plan_nodes(plan_grid(FAR_CORNERS, edge=1.0), settings_of_spacing(0.5))
 
 
 def test_as_many_nodes_as_allowed_are_planned():
     """Some 1210 nodes 0.75 mm apart along each side of 900 mm."""
-    nodes = plan_nodes(plan_grid(FAR_CORNERS, 1.5), settings_of_spacing(0.75))
+    nodes = plan_nodes(plan_grid(FAR_CORNERS, edge=1.5), settings_of_spacing(0.75))
     assert 1200**3 < nodes.count <= MOST_NODES

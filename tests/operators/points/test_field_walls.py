@@ -11,6 +11,11 @@ from clrecon.operators.points.reconstruct import find_walls
 from clrecon.proof.points import field as twin
 
 
+def find_walls_of(near, negative, inside):
+    """The walls of masks of nodes, shape (nz, ny, nx)."""
+    return find_walls(pack_bits(near), pack_bits(negative), pack_bits(inside), nx=inside.shape[2])
+
+
 def pack_bits(mask):
     words = -(-mask.shape[2] // 32)
     padded = np.zeros((*mask.shape[:2], 32 * words), bool)
@@ -22,8 +27,8 @@ def pack_bits(mask):
 def test_walls_at_random_equal_their_twin(shape):
     rng = np.random.default_rng(sum(shape))
     near, negative, inside = (rng.random(shape) < share for share in (0.8, 0.5, 0.4))
-    found = find_walls(pack_bits(near), pack_bits(negative), pack_bits(inside), shape[2])
-    expected = twin.find_walls(near, negative, inside, 32)
+    found = find_walls_of(near, negative, inside)
+    expected = twin.find_walls(near, negative, inside, cube=32)
     assert found.faces.sum() == sum(faces for faces, _, _ in expected.values())
     for place, (faces, walls, enclosed) in expected.items():
         assert (found.faces[place], found.walls[place]) == (faces, walls)
@@ -39,7 +44,7 @@ def walls_of_a_void():
     """Of a box of 6 x 8 x 10 nodes without points within a body of 20 nodes, which lies in one cube of 32."""
     inside = BODY.copy()
     inside[4:10, 5:13, 6:16] = False
-    return find_walls(pack_bits(inside), pack_bits(NO_NODE), pack_bits(inside), 20)
+    return find_walls_of(near=inside, negative=NO_NODE, inside=inside)
 
 
 def test_the_walls_of_a_void_without_support_enclose_its_volume(walls_of_a_void):
@@ -57,29 +62,31 @@ def test_the_only_cube_with_walls_is_the_worst(walls_of_a_void):
 
 HALF = np.repeat(np.arange(20) >= 10, 20 * 20).reshape(20, 20, 20)
 """The upper half of a body of 20 nodes: one flat face of 400."""
-"""The upper half of a body of 20 nodes: one flat face of 400."""
 
 
 def test_a_flat_wall_encloses_nothing():
-    walls = find_walls(pack_bits(HALF), pack_bits(NO_NODE), pack_bits(HALF), 20)
+    walls = find_walls_of(near=HALF, negative=NO_NODE, inside=HALF)
     assert walls.lost == pytest.approx(0.0)
 
 
 def test_a_face_with_support_is_no_wall():
     """All nodes are near points, and those of the upper half on their negative side."""
-    supported = find_walls(pack_bits(BODY), pack_bits(HALF), pack_bits(HALF), 20)
+    supported = find_walls_of(near=BODY, negative=HALF, inside=HALF)
     assert supported.faces.sum() == 20 * 20
     assert supported.walls.sum() == 0
     assert supported.worst(3) == []
 
 
-def balls(holes, radius=7.0, hole=2.6):
-    """Twelve balls, of which so many have a hole at the top."""
+SPACING_MM = 0.65
+
+
+def balls(*, holes):
+    """Twelve balls of 7 mm, 20 mm apart, the first around the origin; so many have a hole of 2.6 mm at the top."""
     points, normals = [], []
     for number in range(12):
-        cloud = sphere_cloud(2600, radius, seed=number)
+        cloud = sphere_cloud(2600, radius=7.0, seed=number)
         if number < holes:
-            cloud = cloud.select(np.flatnonzero(np.linalg.norm(cloud.points - (0, 0, radius), axis=1) > hole))
+            cloud = cloud.select(np.flatnonzero(np.linalg.norm(cloud.points - (0, 0, 7.0), axis=1) > 2.6))
         points.append(cloud.points + np.float32([20.0 * (number % 4), 20.0 * (number // 4), 0.0]))
         normals.append(cloud.normals)
     return PointCloud(np.concatenate(points), np.concatenate(normals))
@@ -87,13 +94,14 @@ def balls(holes, radius=7.0, hole=2.6):
 
 @pytest.fixture(scope="module")
 def whole_balls(device):
-    return reconstruct_surface(balls(holes=0), 0.65, device=device)
+    """The surface of twelve balls."""
+    return reconstruct_surface(balls(holes=0), SPACING_MM, device=device)
 
 
 @pytest.fixture(scope="module")
 def one_open_ball(device):
-    """The ball with the hole is the first, around the origin."""
-    return reconstruct_surface(balls(holes=1), 0.65, device=device)
+    """The surface of twelve balls, of which the one around the origin has a hole."""
+    return reconstruct_surface(balls(holes=1), SPACING_MM, device=device)
 
 
 def test_balls_without_holes_have_no_lost_volume_and_no_warning(whole_balls):
@@ -106,8 +114,9 @@ def test_one_open_ball_of_twelve_is_warned_of_with_its_place(one_open_ball):
     report = one_open_ball.report
     assert report["votes_against_share"] < 0.05  # eleven sound balls outvote the open one
     (warning,) = report["warnings"]
-    assert "of the surface are walls that no points support, most of it within 10.4 mm of" in warning  # 16 nodes
-    worst = report["open_cubes"][0]
+    half_a_cube_mm = 16 * SPACING_MM  # of 32 nodes
+    assert f"are walls that no points support, most of it within {half_a_cube_mm:.1f} mm of" in warning
+    worst, *_ = report["open_cubes"]
     assert np.linalg.norm(worst["centre_mm"]) < 20.0  # the open ball is the one around the origin
     assert worst["wall_share"] > 1.0 / 3.0  # the share a cube is listed from; measured 0.47
 
@@ -120,7 +129,7 @@ def test_the_volume_that_an_open_ball_loses_is_reported_within_half_of_it(whole_
 
 @pytest.mark.parametrize(("shape", "spacing"), [(sphere_cloud, 0.65), (cube_cloud, 0.64)])
 def test_holes_of_one_millimetre_are_bridged_without_a_warning(device, shape, spacing):
-    """Eight of them; a bridge is 1.3 mm long."""
+    """Eight of them; a bridge is as long as two spacings, 1.3 mm."""
     cloud, rng = shape(), np.random.default_rng(5)
     keep = np.ones(len(cloud), bool)
     for centre in cloud.points[rng.integers(0, len(cloud), 8)]:
@@ -133,8 +142,9 @@ def test_holes_of_one_millimetre_are_bridged_without_a_warning(device, shape, sp
     assert report["warnings"] == []
 
 
-def plate_in_lines(thickness=3.0, gap=4.25, n=6000):
-    """A plate of 24 x 34 mm whose faces are sampled in lines `gap` apart, as with slices far apart."""
+def plate_in_lines():
+    """A plate of 3 x 24 x 34 mm whose faces are sampled in lines 4.25 mm apart, as with slices far apart."""
+    thickness, gap, n = 3.0, 4.25, 6000
     rng = np.random.default_rng(1)
     side, rim = (np.where(np.arange(count) % 2, 1.0, -1.0) for count in (n, 1000))
     zero, through = np.zeros(1000), thickness * rng.uniform(-0.5, 0.5, 1000)
@@ -152,7 +162,7 @@ PLATE_ML = 24 * 34 * 3 / 1000
 
 def test_lost_volume_is_warned_of_where_lines_lie_farther_apart_than_nodes_bridge(device):
     """The outside reaches in between lines 4.25 mm apart, where no vote is against it."""
-    mesh = reconstruct_surface(plate_in_lines(), 1.2, bridge=2.5, device=device)
+    mesh = reconstruct_surface(plate_in_lines(), spacing=1.2, bridge=2.5, device=device)
     assert mesh.quality().volume_ml < 0.5 * PLATE_ML  # measured 0.34 of it
     assert mesh.report["votes_against_share"] < 0.001  # measured none
     assert mesh.report["wall_share"] > 0.4  # measured 0.48
@@ -162,7 +172,7 @@ def test_lost_volume_is_warned_of_where_lines_lie_farther_apart_than_nodes_bridg
 
 def test_plate_of_lines_that_nodes_bridge_keeps_its_volume_without_a_warning_of_walls(device):
     """Lines 4.25 mm apart are within 2.5 mm of every node between them."""
-    mesh = reconstruct_surface(plate_in_lines(), 2.5, bridge=2.5, device=device)
+    mesh = reconstruct_surface(plate_in_lines(), spacing=2.5, bridge=2.5, device=device)
     assert mesh.quality().volume_ml == pytest.approx(PLATE_ML, rel=0.12)  # nodes 2.5 mm apart in a plate of 3 mm
     assert mesh.report["wall_share"] < 0.05  # measured 0.022
     assert not any("walls" in text for text in mesh.report["warnings"])

@@ -30,37 +30,36 @@ CLOUDS = {
 }
 
 
-def assert_neighbours_equal_twin(device, points, k):
+def assert_neighbours_equal_twin(device, points, *, k):
     found = find_neighbours(points, k, device=device)
     indices, distances = twin.find_neighbours(np.asarray(points, np.float32), k)
     assert found.indices.dtype == np.int32
     assert found.distances.dtype == np.float32
     assert np.array_equal(found.indices, indices)
     assert np.array_equal(found.distances, distances)
-    return found
 
 
 @pytest.mark.parametrize("n", [1, 2, 63, 64, 65, 1023, 1025, 4097])
 @pytest.mark.parametrize("k", [1, 2, 16, 37])
 def test_neighbours_of_scattered_points_equal_the_twin(device, n, k):
-    assert_neighbours_equal_twin(device, scattered_points(n), min(k, n))
+    assert_neighbours_equal_twin(device, scattered_points(n), k=min(k, n))
 
 
 @pytest.mark.every_device
 @pytest.mark.parametrize("cloud", CLOUDS)
 @pytest.mark.parametrize("k", daily(1, [1, 16]))
 def test_neighbours_of_awkward_clouds_equal_the_twin(device, cloud, k):
-    assert_neighbours_equal_twin(device, CLOUDS[cloud], k)
+    assert_neighbours_equal_twin(device, CLOUDS[cloud], k=k)
 
 
 def test_most_neighbours_allowed_equal_the_twin(device):
-    assert_neighbours_equal_twin(device, scattered_points(900), neighbours.MOST_NEIGHBOURS)
+    assert_neighbours_equal_twin(device, scattered_points(900), k=neighbours.MOST_NEIGHBOURS)
 
 
 @pytest.mark.parametrize("edge", [0.5, 2.0, 9.0, 50.0])
 def test_neighbours_are_the_same_in_cells_of_any_size(device, edge, monkeypatch):
     monkeypatch.setattr(neighbours, "choose_cell_edge", lambda points, k: edge)
-    assert_neighbours_equal_twin(device, scattered_points(3000), 16)
+    assert_neighbours_equal_twin(device, scattered_points(3000), k=16)
 
 
 def points_of_two_parts(device):
@@ -69,12 +68,12 @@ def points_of_two_parts(device):
 
 
 def test_a_cloud_of_two_parts_has_the_neighbours_of_its_twin(device):
-    assert_neighbours_equal_twin(device, points_of_two_parts(device), 8)
+    assert_neighbours_equal_twin(device, points_of_two_parts(device), k=8)
 
 
 def test_progress_of_neighbours_is_told_after_each_part(device):
     points, told = points_of_two_parts(device), []
-    find_neighbours(points, 8, device=device, progress=lambda *step: told.append(step))
+    find_neighbours(points, k=8, device=device, progress=lambda *step: told.append(step))
     assert len(told) == 2
     assert told[-1] == ("neighbours", len(points), len(points))
 
@@ -82,37 +81,41 @@ def test_progress_of_neighbours_is_told_after_each_part(device):
 @pytest.mark.oclgrind
 def test_neighbours_of_a_small_cloud_with_equal_points_and_an_outlier_equal_the_twin(device):
     points = np.r_[scattered_points(150), np.zeros((30, 3)), [[300.0, 0.0, 0.0]]]
-    assert_neighbours_equal_twin(device, points, 7)
+    assert_neighbours_equal_twin(device, points, k=7)
+
+
+K = 16
 
 
 @pytest.fixture(scope="module")
 def neighbours_and_tree(device):
-    """The 16 nearest of 8000 points, and by scipy's tree the 17 nearest: distances and indices."""
+    """The K nearest of 8000 points, and by scipy's tree K + 1: distances and indices."""
     from scipy.spatial import cKDTree
 
     points = scattered_points(8000, (30.0, 30.0, 30.0))
     exact = points.astype(np.float64)
-    return find_neighbours(PointCloud(points), 16, device=device), *cKDTree(exact).query(exact, 17)
+    return find_neighbours(PointCloud(points), K, device=device), *cKDTree(exact).query(exact, K + 1)
 
 
 def test_distances_to_neighbours_are_those_of_scipy(neighbours_and_tree):
     found, distances, _ = neighbours_and_tree
-    steps = np.spacing(distances[:, :16].astype(np.float32))
-    assert np.all(np.abs(found.distances - distances[:, :16]) <= TREE_DISTANCE_STEPS * steps)
+    steps = np.spacing(distances[:, :K].astype(np.float32))
+    assert np.all(np.abs(found.distances - distances[:, :K]) <= TREE_DISTANCE_STEPS * steps)
 
 
 def test_neighbours_are_those_of_scipy_where_the_next_one_is_farther(neighbours_and_tree):
     found, distances, indices = neighbours_and_tree
-    clear = distances[:, 16] - distances[:, 15] > 1e-5
+    last, next_one = distances[:, K - 1], distances[:, K]
+    clear = next_one - last > 1e-5
     assert clear.mean() > 0.9  # every twentieth point is there twice
-    assert np.array_equal(np.sort(found.indices[clear], axis=1), np.sort(indices[clear, :16], axis=1))
+    assert np.array_equal(np.sort(found.indices[clear], axis=1), np.sort(indices[clear, :K], axis=1))
 
 
 @pytest.mark.parametrize("shift", [5000.0, 1e5])
 def test_far_clouds_keep_their_neighbours_except_for_rounding(device, shift):
     points = np.round(scattered_points(3000).astype(np.float64), 3)
-    near = find_neighbours(points - 2.0, 16, device=device)
-    far = find_neighbours(points + shift, 16, device=device)
+    near = find_neighbours(points - 2.0, k=16, device=device)
+    far = find_neighbours(points + shift, k=16, device=device)
     assert np.mean(near.indices != far.indices) < 1e-3  # equal distances of whole micrometres, rounded otherwise
     assert np.abs(near.distances - far.distances).max() < 1e-4  # of some millimetres in float32
 
@@ -120,26 +123,26 @@ def test_far_clouds_keep_their_neighbours_except_for_rounding(device, shift):
 def test_permuted_points_give_permuted_neighbours(device):
     points = RNG.uniform(0, 20, (2000, 3)).astype(np.float32)  # no two distances of a point are equal
     order = RNG.permutation(len(points))
-    straight = find_neighbours(points, 12, device=device)
-    permuted = find_neighbours(points[order], 12, device=device)
+    straight = find_neighbours(points, k=12, device=device)
+    permuted = find_neighbours(points[order], k=12, device=device)
     assert np.array_equal(order[permuted.indices], straight.indices[order])
     assert np.array_equal(permuted.distances, straight.distances[order])
 
 
 def test_fewer_points_than_neighbours_are_each_others_neighbours_with_a_warning(device):
-    found = find_neighbours(scattered_points(5), 16, device=device)
+    found = find_neighbours(scattered_points(5), k=16, device=device)
     assert found.indices.shape == (5, 5)
     assert "the cloud has 5 points" in found.warnings[0]
 
 
 def test_as_many_points_as_neighbours_are_not_warned_of(device):
-    assert find_neighbours(scattered_points(5), 5, device=device).warnings == ()
+    assert find_neighbours(scattered_points(5), k=5, device=device).warnings == ()
 
 
 @pytest.mark.release
 def test_a_hundred_thousand_equal_points_have_the_first_sixteen_as_neighbours(device):
     """Each of them would be compared with all: a minute, and a hundred for ten times as many."""
-    found = find_neighbours(np.zeros((100_000, 3), np.float32), 16, device=device)
+    found = find_neighbours(np.zeros((100_000, 3), np.float32), k=16, device=device)
     assert np.array_equal(found.indices, np.broadcast_to(np.arange(16), (100_000, 16)))
     assert not found.distances.any()
 
@@ -149,7 +152,7 @@ def crowded_grid(device):
     """Five points at one place in one cell, four others in a second and three in a third; points of each cell."""
     apart = np.array([[0.1, 0.0, 0.0], [0.2, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]])
     points = np.concatenate([np.zeros((5, 3)), apart + (10.0, 0.0, 0.0), apart[:3] + (20.0, 0.0, 0.0)])
-    grid = fill_grid(device, plan_grid(points, 1.0))
+    grid = fill_grid(device, plan_grid(points, edge=1.0))
     starts = download(device, np.empty(grid.cells + 1, np.uint32), grid.starts_d)
     assert sorted(np.diff(starts).tolist()) == [3, 4, 5]
     return grid, starts
@@ -194,7 +197,7 @@ def test_neighbours_in_a_spot_of_a_million_points_among_far_ones_are_refused(dev
 
 def test_too_little_memory_for_a_search_for_neighbours_is_refused(device):
     with refused(DeviceMemoryError, 10_000, "points"):
-        find_neighbours(scattered_points(10_000), 16, device=device, memory=500_000)
+        find_neighbours(scattered_points(10_000), k=16, device=device, memory=500_000)
 
 
 def clouds_of_30_000_points(seed):

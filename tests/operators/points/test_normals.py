@@ -22,6 +22,12 @@ from clrecon.proof.points.clusters import find_gradients as gradients_twin
 from clrecon.proof.points.neighbours import find_neighbours, orient_by_gradients, orient_from, principal_axes
 
 
+def axes_by_twin(points, *, k):
+    """Principal axes of the k nearest points of each, and their eigenvalues, both (n, 3)."""
+    indices, _ = find_neighbours(points, k)
+    return principal_axes(points, indices)
+
+
 def degrees_between(a, b):
     return np.degrees(np.arcsin(np.clip(np.linalg.norm(np.cross(a, b), axis=1), 0.0, 1.0)))
 
@@ -30,8 +36,8 @@ def degrees_between(a, b):
 @pytest.mark.parametrize("noisy", [True, False])
 def test_normals_without_orientation_are_the_principal_axes_of_the_twin(device, shape, noisy):
     points = shape().points if noisy else shape().clean
-    normals_found = estimate_normals(PointCloud(points), 12, device=device).cloud.normals
-    axes, eigenvalues = principal_axes(points, find_neighbours(points, 12)[0])
+    normals_found = estimate_normals(PointCloud(points), k=12, device=device).cloud.normals
+    axes, eigenvalues = axes_by_twin(points, k=12)
     away = degrees_between(normals_found, axes)
     assert np.median(away) < TWIN_AXIS_DEGREES
     gap_of_smaller_eigenvalues = (eigenvalues[:, 1] - eigenvalues[:, 0]) / eigenvalues[:, 2]
@@ -41,7 +47,7 @@ def test_normals_without_orientation_are_the_principal_axes_of_the_twin(device, 
 
 
 def test_normals_without_orientation_are_warned_of(device):
-    step = estimate_normals(PointCloud(sphere().points), 12, device=device)
+    step = estimate_normals(PointCloud(sphere().points), device=device)
     assert step.facts["oriented_by"] is None
     assert "either direction" in step.warnings[0]
 
@@ -51,12 +57,12 @@ def test_normals_without_orientation_are_warned_of(device):
 def test_normals_of_clouds_around_multiples_of_eight_points_equal_their_twin(device, n):
     """The kernel works on vectors of eight points."""
     points = np.random.default_rng(n).normal(size=(n, 3)).astype(np.float32)
-    found = estimate_normals(PointCloud(points), 3, device=device).cloud.normals
-    axes, _ = principal_axes(points, find_neighbours(points, 3)[0])
+    found = estimate_normals(PointCloud(points), k=3, device=device).cloud.normals
+    axes, _ = axes_by_twin(points, k=3)
     assert degrees_between(found, axes).max() < TWIN_AXIS_NEAR_DOUBLE_DEGREES
 
 
-INNER_VIEWPOINT = (1.0, 2.0, -1.0)  # within a sphere of 20 mm around the origin
+INNER_VIEWPOINT = (1.0, 2.0, -1.0)  # within `sphere()`, which has 20 mm around the origin
 
 
 def test_normals_point_away_from_a_viewpoint_within_a_sphere(device):
@@ -69,14 +75,17 @@ def test_normals_point_away_from_a_viewpoint_within_a_sphere(device):
 
 def test_normals_are_turned_by_a_viewpoint_as_by_the_twin(device):
     points = sphere().points
-    found = estimate_normals(PointCloud(points), viewpoint=INNER_VIEWPOINT, device=device).cloud.normals
-    axes, _ = principal_axes(points, find_neighbours(points, 16)[0])
+    found = estimate_normals(PointCloud(points), k=16, viewpoint=INNER_VIEWPOINT, device=device).cloud.normals
+    axes, _ = axes_by_twin(points, k=16)
     expected = orient_from(axes, points, np.array(INNER_VIEWPOINT))
     assert np.mean((found * expected).sum(axis=1) > 0.0) > 0.9999  # others lie square to the line of sight
 
 
-def ball(dtype="int16", affine=None, shape=(40, 40, 40), radius=14.0, steepness=100.0):
-    """A ball of 1 mm voxels: HU fall by `steepness` a mm from 0 at the surface."""
+RADIUS_MM, SLICES = 14.0, 40
+
+
+def ball(*, dtype="int16", affine=None, shape=(SLICES, 40, 40), radius=RADIUS_MM, steepness=100.0):
+    """A ball whose HU fall by `steepness` a mm from 0 at its surface, and its middle in mm; voxels of 1 mm."""
     affine = np.eye(4) if affine is None else affine
     volume = Volume(np.zeros(shape, dtype), affine)
     index = np.stack(np.meshgrid(*[np.arange(size) for size in shape[::-1]], indexing="ij"), -1).reshape(-1, 3)
@@ -94,7 +103,7 @@ OBLIQUE = np.array([[0.7, 0.1, 0.3, -40], [-0.1, 0.8, 0.2, 25], [0.05, 0.1, 1.3,
 @pytest.mark.parametrize("dtype", VOXEL_TYPES)
 @pytest.mark.parametrize("affine", [np.eye(4), OBLIQUE])
 def test_gradients_equal_their_twin(device, dtype, affine):
-    volume, middle = ball(dtype, affine, (22, 24, 20), 8.0, 9.0)
+    volume, middle = ball(dtype=dtype, affine=affine, shape=(22, 24, 20), radius=8.0, steepness=9.0)
     points = middle + np.random.default_rng(3).uniform(-14.0, 14.0, (800, 3))  # some beyond the border
     resident = DeviceVolume(volume, device=device)
     found = normals.find_gradients(resident, points, stopwatch=Stopwatch())
@@ -110,7 +119,7 @@ def linear_field_in_uneven_slices(sign):
     nk, nj, ni = empty.voxels.shape
     index = np.stack(np.meshgrid(np.arange(ni), np.arange(nj), np.arange(nk), indexing="ij"), -1)
     values = empty.ijk_to_lps(index.reshape(-1, 3)) @ SLOPE
-    return uneven(values.reshape(ni, nj, nk).transpose(2, 1, 0).astype(np.float32), sign)
+    return uneven(values.reshape(ni, nj, nk).transpose(2, 1, 0).astype(np.float32), sign=sign)
 
 
 def points_within(volume):
@@ -130,7 +139,8 @@ def test_gradients_of_a_linear_field_in_uneven_slices_are_its_slope(device, sign
 @pytest.mark.parametrize("sign", [1.0, -1.0], ids=["along the normal", "against it"])
 def test_gradients_of_the_twin_of_a_linear_field_in_uneven_slices_are_its_slope(sign):
     volume = linear_field_in_uneven_slices(sign)
-    found = gradients_twin(volume, points_within(volume), -1024.0)
+    air = -1024.0  # beyond the volume
+    found = gradients_twin(volume, points_within(volume), air)
     assert np.abs(found - SLOPE).max() < GRADIENT_SHARE * np.abs(SLOPE).max()
 
 
@@ -148,7 +158,7 @@ def test_slabs_have_the_same_gradients(device):
 
     assert np.array_equal(parts, whole)
     assert len(told) >= 7  # 40 slices, 6 at a time: of 9, one below and two above are neighbours
-    assert told[-1] == ("gradients", 40, 40)
+    assert told[-1] == ("gradients", SLICES, SLICES)
 
 
 @pytest.mark.parametrize("affine", [np.eye(4), OBLIQUE], ids=["straight", "oblique"])
@@ -189,9 +199,10 @@ def points_of_a_thin_wall():
 def test_doubtful_normals_of_a_thin_wall_follow_the_gradient(device, points_of_a_thin_wall):
     """Principal axes lie across the wall, the gradient knows the side."""
     volume, points = points_of_a_thin_wall
-    step = estimate_normals(PointCloud(points), 16, volume=volume, device=device)
+    step = estimate_normals(PointCloud(points), k=16, volume=volume, device=device)
 
-    axes, _ = principal_axes(points, find_neighbours(points.astype(np.float32), 16)[0])
+    indices, _ = find_neighbours(points.astype(np.float32), k=16)
+    axes, _ = principal_axes(points, indices)
     expected, doubtful = orient_by_gradients(axes, gradients_twin(volume, points, -50.0))
     assert step.facts["doubtful"] == doubtful.sum() > 20  # measured 30
     found = step.cloud.normals[doubtful]
@@ -201,7 +212,7 @@ def test_doubtful_normals_of_a_thin_wall_follow_the_gradient(device, points_of_a
 
 def test_doubtful_normals_of_a_thin_wall_are_warned_of(device, points_of_a_thin_wall):
     volume, points = points_of_a_thin_wall
-    step = estimate_normals(PointCloud(points), 16, volume=volume, device=device)
+    step = estimate_normals(PointCloud(points), k=16, volume=volume, device=device)
     (warning,) = step.warnings
     assert warning.startswith(f"{step.facts['doubtful']} of 30 normals (")
     assert "are doubtful and follow the HU alone: the 16 nearest points" in warning
@@ -235,7 +246,7 @@ def test_few_normals_are_doubtful_after_thinning_to_the_slice_gap(device):
 
 def test_points_beyond_the_volume_are_unoriented_and_warned_of(device):
     volume, middle = ball()
-    on_ball, beyond = middle + 14.0 * sphere(1.0).normals, middle + 500.0 + plane(4.0).clean
+    on_ball, beyond = middle + RADIUS_MM * sphere(radius=1.0).normals, middle + 500.0 + plane(size=4.0).clean
     points = np.r_[on_ball, beyond]
     step = estimate_normals(PointCloud(points), volume=volume, device=device)
     assert step.facts["unoriented"] == len(beyond)
@@ -244,9 +255,9 @@ def test_points_beyond_the_volume_are_unoriented_and_warned_of(device):
 
 def test_points_in_a_line_or_at_one_place_have_no_normal_and_are_warned_of(device):
     line, one_place = np.outer(np.arange(20.0), [1.0, 2.0, -1.0]), np.zeros((30, 3))
-    step = estimate_normals(PointCloud(np.r_[line, one_place]), 5, viewpoint=(9, 9, 9), device=device)
+    step = estimate_normals(PointCloud(np.r_[line, one_place]), k=5, viewpoint=(9, 9, 9), device=device)
     assert not step.cloud.normals.any()
-    assert step.facts["without_plane"] == 20 + 30
+    assert step.facts["without_plane"] == len(line) + len(one_place)
     assert "in a line or at one place" in step.warnings[0]
 
 
@@ -265,7 +276,7 @@ def points_on_lines(seed):
 @pytest.mark.parametrize("k", daily(2, [3, 5, 16, 64]))
 def test_points_on_lines_of_any_direction_have_no_normal(device, k):
     points = points_on_lines(k)
-    step = estimate_normals(PointCloud(points), k, device=device)
+    step = estimate_normals(PointCloud(points), k=k, device=device)
     assert not step.cloud.normals.any()
     assert step.facts["without_plane"] == len(points)
 
@@ -273,7 +284,7 @@ def test_points_on_lines_of_any_direction_have_no_normal(device, k):
 @pytest.mark.parametrize("k", daily(2, [3, 5, 16, 64]))
 def test_points_on_lines_of_any_direction_have_no_principal_axis_of_the_twin(k):
     points = points_on_lines(k)
-    axes, _ = principal_axes(points, find_neighbours(points, k)[0])
+    axes, _ = axes_by_twin(points, k=k)
     assert not axes.any()
 
 
@@ -281,18 +292,18 @@ def test_points_on_lines_of_any_direction_have_no_principal_axis_of_the_twin(k):
 def test_points_of_a_narrow_strip_have_its_normal(device, width):
     """Ten neighbours along 1 mm of a strip that is a fiftieth as wide, or a third."""
     along, across = np.arange(200.0), width * np.tile((0.0, 1.0), 100)
-    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    turn, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
     points = np.column_stack((0.1 * along, across, np.zeros(200))) @ turn.T
-    step = estimate_normals(PointCloud(points), 10, device=device)
+    step = estimate_normals(PointCloud(points), k=10, device=device)
     assert step.facts["without_plane"] == 0
     assert np.abs(step.cloud.normals @ turn[:, 2]).min() > 0.999  # within 2.6 degrees
 
 
 def test_normals_of_a_cloud_of_two_parts_equal_their_twin_and_point_outward(device):
     """A kernel takes a part of a large cloud at a time; devices without long work-items take larger parts."""
-    truth = sphere(48.0 if device.has_long_items else 190.0)
-    step = estimate_normals(PointCloud(truth.points), 8, viewpoint=(0, 0, 0), device=device)
-    axes, _ = principal_axes(truth.points, find_neighbours(truth.points, 8)[0])
+    truth = sphere(radius=48.0 if device.has_long_items else 190.0)
+    step = estimate_normals(PointCloud(truth.points), k=8, viewpoint=(0, 0, 0), device=device)
+    axes, _ = axes_by_twin(truth.points, k=8)
     assert np.median(degrees_between(step.cloud.normals, axes)) < TWIN_AXIS_DEGREES
     assert ((step.cloud.normals * truth.points).sum(axis=1) > 0.0).all()
 
@@ -300,24 +311,27 @@ def test_normals_of_a_cloud_of_two_parts_equal_their_twin_and_point_outward(devi
 @pytest.mark.oclgrind
 def test_normals_of_a_few_points_on_a_ball_of_bone_point_outward(device):
     volume, middle = ball(shape=(12, 12, 12), radius=4.0)
-    outward = sphere(2.0).normals
-    step = estimate_normals(PointCloud(middle + 4.0 * outward), 6, volume=volume, device=device)
+    outward = sphere(radius=2.0).normals
+    step = estimate_normals(PointCloud(middle + 4.0 * outward), k=6, volume=volume, device=device)
     assert (step.cloud.normals * outward).sum(axis=1).min() > 0.3  # six neighbours lie some 3 mm apart
 
 
 def test_normals_of_a_shifted_cloud_are_the_same_except_for_rounding(device):
     shift = 1e5
-    points = np.round(sphere(6.0).points.astype(np.float64), 3)
+    points = np.round(sphere(radius=6.0).points.astype(np.float64), 3)
     near = estimate_normals(PointCloud(points), viewpoint=(0, 0, 0), device=device).cloud
     far = estimate_normals(PointCloud(points + shift), viewpoint=(shift, shift, shift), device=device).cloud
     assert np.median(degrees_between(near.normals, far.normals)) < 0.01  # float32 relative to the cloud's middle
     assert (near.normals * far.normals).sum(axis=1).min() > 0.0
 
 
+VOLUME = Volume(np.zeros((12, 12, 12), np.int16), np.eye(4))
+
+
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
-        ({"volume": ball(shape=(12, 12, 12))[0], "viewpoint": (0, 0, 0)}, "not both"),
+        ({"volume": VOLUME, "viewpoint": (0, 0, 0)}, "not both"),
         ({"viewpoint": (0, np.nan, 0)}, "three numbers in LPS mm"),
         ({"k": 2}, "from 3 to 128"),
     ],

@@ -17,22 +17,22 @@ from clrecon.proof.points.neighbours import find_neighbours, find_outliers, mean
 @pytest.mark.parametrize("deviations", [0.0, 1.0, 2.0, 3.5])
 @pytest.mark.parametrize("k", [2, 16])
 def test_outliers_and_their_mean_distance_equal_the_twin(device, deviations, k):
-    points = sphere(10.0).points
-    step = remove_outliers(PointCloud(points), k, deviations, device=device)
+    points = sphere(radius=10.0).points
+    step = remove_outliers(PointCloud(points), k=k, deviations=deviations, device=device)
     _, distances = find_neighbours(points, k)
     assert np.array_equal(step.removed, find_outliers(distances, deviations))
     assert step.facts["mean_distance_mm"] == pytest.approx(mean_distances(distances).mean(), rel=MEAN_DISTANCE_SHARE)
 
 
 def test_points_that_are_no_outliers_stay_and_outliers_are_counted(device):
-    points = sphere(10.0).points
+    points = sphere(radius=10.0).points
     step = remove_outliers(PointCloud(points), device=device)
     assert np.array_equal(step.cloud.points, points[step.removed == 0])
     assert step.counts == {"outlier": np.count_nonzero(step.removed)}
 
 
 def test_far_points_are_outliers_and_nearly_all_of_a_sphere_stays_with_its_hu(device):
-    shape, rng = sphere(10.0).points, np.random.default_rng(5)
+    shape, rng = sphere(radius=10.0).points, np.random.default_rng(5)
     far = rng.uniform(-60, 60, (30, 3))
     far = far[np.linalg.norm(far, axis=1) > 20]
     cloud = PointCloud(np.r_[shape, far], hu=np.arange(len(shape) + len(far)))
@@ -45,7 +45,7 @@ def test_far_points_are_outliers_and_nearly_all_of_a_sphere_stays_with_its_hu(de
 def test_a_ring_of_equal_distances_has_no_outlier(device):
     angles = 2.0 * np.pi * np.arange(64) / 64
     ring = np.c_[np.cos(angles), np.sin(angles), np.zeros(64)]
-    assert not remove_outliers(PointCloud(ring), 3, 2.0, device=device).removed.any()
+    assert not remove_outliers(PointCloud(ring), k=3, deviations=2.0, device=device).removed.any()
 
 
 def test_equal_points_have_no_outlier(device):
@@ -54,15 +54,15 @@ def test_equal_points_have_no_outlier(device):
 
 @pytest.mark.oclgrind
 def test_far_point_of_a_small_cloud_is_an_outlier(device):
-    points = np.r_[sphere(3.0).points, [[30.0, 0.0, 0.0]]]
-    step = remove_outliers(PointCloud(points), 6, device=device)
+    points = np.r_[sphere(radius=3.0).points, [[30.0, 0.0, 0.0]]]
+    step = remove_outliers(PointCloud(points), k=6, device=device)
     assert step.removed[-1] == 1
 
 
 @pytest.mark.parametrize("deviations", [-1.0, float("nan"), float("inf"), "2", True])
 def test_wrong_deviations_are_refused(device, deviations):
     with refused(UsageError, 0):
-        remove_outliers(PointCloud(np.eye(3)), 2, deviations, device=device)
+        remove_outliers(PointCloud(np.eye(3)), k=2, deviations=deviations, device=device)
 
 
 def test_one_point_alone_stays_with_a_warning(device):

@@ -12,14 +12,14 @@ from clrecon import PointCloud, Volume, extract_isosurface, reconstruct_surface
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.proof.phantom import PhantomSettings, make_phantom
 
-BALL_ML = 4.0 / 3.0 * np.pi * 2.0**3  # radius 20 mm
+SPACING_MM = 0.65
 
 
 def rms(values):
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def sphere_error(mesh, radius=20.0):
+def sphere_error(mesh, *, radius):
     """The rms distance of the vertices from a sphere around the origin, mm."""
     return rms(np.linalg.norm(mesh.vertices.astype(float), axis=1) - radius)
 
@@ -33,14 +33,15 @@ def assert_closed(mesh, components=1):
 
 @pytest.fixture(scope="module")
 def sphere_mesh(device):
-    """Of 12,000 points on a sphere of 20 mm, at a spacing of 0.65 mm."""
-    return reconstruct_surface(sphere_cloud(), 0.65, device=device)
+    """The surface of 12,000 points on a sphere of 20 mm."""
+    return reconstruct_surface(sphere_cloud(12_000, radius=20.0), SPACING_MM, device=device)
 
 
 def test_surface_of_a_sphere_without_noise_is_closed_and_near_it(sphere_mesh):
     assert_closed(sphere_mesh)
-    assert sphere_error(sphere_mesh) < 0.015  # measured 0.007
-    assert sphere_mesh.quality().volume_ml == pytest.approx(BALL_ML, rel=5e-4)  # measured 3e-4
+    assert sphere_error(sphere_mesh, radius=20.0) < 0.015  # measured 0.007
+    ball_ml = 4 / 3 * np.pi * 2.0**3
+    assert sphere_mesh.quality().volume_ml == pytest.approx(ball_ml, rel=5e-4)  # measured 3e-4
 
 
 def test_normals_of_a_reconstructed_sphere_point_outward(sphere_mesh):
@@ -49,10 +50,10 @@ def test_normals_of_a_reconstructed_sphere_point_outward(sphere_mesh):
 
 
 def test_report_of_a_reconstruction_names_its_lengths(sphere_mesh):
-    report, spacing = sphere_mesh.report, 0.65
-    assert (report["spacing_mm"], report["spacing_from"]) == (spacing, "caller")
-    assert (report["reach_mm"], report["bridge_mm"]) == (2 * spacing, 2 * spacing)
-    assert report["smoothing_mm"] == pytest.approx(0.1 * spacing)
+    report = sphere_mesh.report
+    assert (report["spacing_mm"], report["spacing_from"]) == (SPACING_MM, "caller")
+    assert (report["reach_mm"], report["bridge_mm"]) == (2 * SPACING_MM, 2 * SPACING_MM)
+    assert report["smoothing_mm"] == pytest.approx(0.1 * SPACING_MM)
 
 
 def test_report_of_a_reconstruction_counts_points_regions_slabs_and_votes(sphere_mesh):
@@ -66,74 +67,77 @@ def test_report_of_a_reconstruction_has_no_iso_value(sphere_mesh):
 
 
 def test_surface_of_a_cube_without_noise_is_closed_and_near_it(device):
-    mesh = reconstruct_surface(cube_cloud(), 0.64, device=device)
+    mesh = reconstruct_surface(cube_cloud(13_000, edge=30.0), spacing=0.64, device=device)
     assert_closed(mesh)
-    assert rms(cube_distances(mesh.vertices)) < 0.046  # measured 0.034, at edges that nodes 0.64 mm apart round
+    away = cube_distances(mesh.vertices, edge=30.0)
+    assert rms(away) < 0.046  # measured 0.034, at edges that nodes 0.64 mm apart round
     assert mesh.quality().volume_ml == pytest.approx(3.0**3, rel=1e-3)  # measured 1.2e-4
 
 
 def test_noise_of_0p2_mm_is_averaged_in_the_surface_and_twice_as_much_where_the_cloud_is_noisy(device):
-    cloud = sphere_cloud(noise=0.2)
-    clean, noisy = (reconstruct_surface(cloud, 0.65, noisy=choice, device=device) for choice in (False, True))
+    cloud = sphere_cloud(12_000, radius=20.0, noise=0.2)
+    clean, noisy = (reconstruct_surface(cloud, SPACING_MM, noisy=choice, device=device) for choice in (False, True))
     assert_closed(noisy)
-    assert sphere_error(clean) == pytest.approx(0.125, rel=0.1)  # measured
-    assert sphere_error(noisy) == pytest.approx(0.063, rel=0.1)  # measured
+    assert sphere_error(clean, radius=20.0) == pytest.approx(0.125, rel=0.1)  # measured
+    assert sphere_error(noisy, radius=20.0) == pytest.approx(0.063, rel=0.1)  # measured
 
 
 def test_lengths_for_a_noisy_cloud_are_three_spacings_of_reach_and_a_thousand_of_smoothing(device):
-    mesh = reconstruct_surface(sphere_cloud(2000, 8.0), 0.65, noisy=True, device=device)
-    assert mesh.report["reach_mm"] == pytest.approx(3 * 0.65)
-    assert mesh.report["smoothing_mm"] == pytest.approx(1000 * 0.65)
+    mesh = reconstruct_surface(sphere_cloud(2000, radius=8.0), SPACING_MM, noisy=True, device=device)
+    assert mesh.report["reach_mm"] == pytest.approx(3 * SPACING_MM)
+    assert mesh.report["smoothing_mm"] == pytest.approx(1000 * SPACING_MM)
 
 
-SHORT_BRIDGE = 1.2  # mm: the outside leaks into a cube of 13,000 points between nodes of 0.64 mm
+CUBE = cube_cloud(13_000, edge=30.0)
+SHORT_BRIDGE = {"spacing": 0.64, "bridge": 1.2}  # mm: the outside leaks into the cube
 
 
 def test_a_leak_is_refused_without_widenings(device):
     with refused(RefusedInputError, 1, "votes"):
-        reconstruct_surface(cube_cloud(), 0.64, bridge=SHORT_BRIDGE, widenings=0, device=device)
+        reconstruct_surface(CUBE, **SHORT_BRIDGE, widenings=0, device=device)
 
 
 def test_a_leak_is_closed_by_a_bridge_wider_by_a_quarter(device):
-    mesh = reconstruct_surface(cube_cloud(), 0.64, bridge=SHORT_BRIDGE, device=device)
+    mesh = reconstruct_surface(CUBE, **SHORT_BRIDGE, device=device)
     assert_closed(mesh)
-    assert rms(cube_distances(mesh.vertices)) < 0.1  # mm; measured 0.074
+    assert rms(cube_distances(mesh.vertices, edge=30.0)) < 0.1  # mm; measured 0.074
     report = mesh.report
     assert report["tries"] == 2
-    assert report["bridge_mm"] == pytest.approx(1.25 * SHORT_BRIDGE)
+    assert report["bridge_mm"] == pytest.approx(1.25 * SHORT_BRIDGE["bridge"])
     assert report["reach_mm"] >= report["bridge_mm"]
     assert "with a bridge of 1.2 mm 50 % of the votes" in report["warnings"][0]
 
 
 def test_a_leak_that_most_votes_are_against_is_warned_of(device):
     """A whole ball outvotes a smaller one that is open at its top."""
-    whole, small = sphere_cloud(6000, 10.0), sphere_cloud(720, 6.0, centre=(25.0, 0.0, 0.0))
+    whole, small = sphere_cloud(6000, radius=10.0), sphere_cloud(720, radius=6.0, centre=(25.0, 0.0, 0.0))
     open_top = small.select(np.flatnonzero(small.points[:, 2] < 0.6 * 6.0))
     both = PointCloud(np.r_[whole.points, open_top.points], np.r_[whole.normals, open_top.normals])
-    warnings = reconstruct_surface(both, 0.65, device=device).report["warnings"]
+    warnings = reconstruct_surface(both, SPACING_MM, device=device).report["warnings"]
     assert "votes are against the winner: parts of the cloud may be open" in warnings[0]
 
 
 def test_a_whole_ball_is_not_warned_of(device):
-    assert reconstruct_surface(sphere_cloud(6000, 10.0), 0.65, device=device).report["warnings"] == []
+    whole = sphere_cloud(6000, radius=10.0)
+    assert reconstruct_surface(whole, SPACING_MM, device=device).report["warnings"] == []
 
 
 def test_a_sphere_without_its_upper_quarter_is_refused_after_all_widenings(device):
-    cloud = sphere_cloud(3000, 10.0)
+    cloud = sphere_cloud(3000, radius=10.0)
     open_top = cloud.select(np.flatnonzero(cloud.points[:, 2] < 5.0))
-    with refused(RefusedInputError, 0.65):
-        reconstruct_surface(open_top, 0.65, device=device)
+    with refused(RefusedInputError, SPACING_MM):
+        reconstruct_surface(open_top, SPACING_MM, device=device)
 
 
 def test_normals_that_point_inward_are_refused(device):
-    cloud = sphere_cloud(3000, 10.0)
+    cloud = sphere_cloud(3000, radius=10.0)
     with refused(RefusedInputError, 100, "point"):
-        reconstruct_surface(cloud.changed(normals=-cloud.normals), 0.65, device=device)
+        reconstruct_surface(cloud.changed(normals=-cloud.normals), SPACING_MM, device=device)
 
 
 def test_the_spacing_is_estimated_from_the_points(device):
-    """A square of that side has one of the 2000 points on a sphere of 8 mm."""
-    mesh = reconstruct_surface(sphere_cloud(2000, 8.0), device=device)
+    """A square of that side has one of the points."""
+    mesh = reconstruct_surface(sphere_cloud(2000, radius=8.0), device=device)
     assert_closed(mesh)
     assert mesh.report["spacing_from"] == "points"
     area_a_point = 4 * np.pi * 8.0**2 / 2000
@@ -148,22 +152,25 @@ def test_points_that_coincide_are_refused_without_a_spacing(device):
 
 def test_a_cloud_far_from_the_origin_has_as_good_a_surface_in_float64(device):
     shift = np.array((100_000.0, -50_000.0, 70_000.0))
-    near = sphere_cloud(2000, 8.0)
+    near = sphere_cloud(2000, radius=8.0)
     far = PointCloud(near.points + shift, near.normals)
-    near_mesh, far_mesh = (reconstruct_surface(cloud, 0.65, device=device) for cloud in (near, far))
+    near_mesh, far_mesh = (reconstruct_surface(cloud, SPACING_MM, device=device) for cloud in (near, far))
     assert_closed(far_mesh)
     assert far_mesh.vertices.dtype == np.float64
     far_error = rms(np.linalg.norm(far_mesh.vertices - shift, axis=1) - 8.0)
-    assert far_error == pytest.approx(sphere_error(near_mesh, 8.0), abs=FAR_FIELD_MM)
+    assert far_error == pytest.approx(sphere_error(near_mesh, radius=8.0), abs=FAR_FIELD_MM)
 
 
 def test_less_memory_gives_the_same_mesh(device):
-    cloud = sphere_cloud(3000, 12.0)
-    whole = reconstruct_surface(cloud, 0.5, device=device)
-    parts = reconstruct_surface(cloud, 0.5, device=device, memory=1_400_000)
+    cloud = sphere_cloud(3000, radius=12.0)
+    whole = reconstruct_surface(cloud, spacing=0.5, device=device)
+    parts = reconstruct_surface(cloud, spacing=0.5, device=device, memory=1_400_000)
     assert parts.report["slabs"] > 1
     assert np.array_equal(whole.vertices, parts.vertices)
     assert np.array_equal(whole.triangles, parts.triangles)
+
+
+SPACING_AGAIN_MM = 0.9
 
 
 @pytest.fixture(scope="module")
@@ -173,7 +180,7 @@ def torus_twice(device):
     voxels, affine, _ = make_phantom(settings)
     first = extract_isosurface(Volume(voxels, affine), 226, device=device)
     cloud = PointCloud(first.vertices, first.normals, report={"certificate": {"series": "torus"}})
-    return first, reconstruct_surface(cloud, 0.9, device=device)
+    return first, reconstruct_surface(cloud, SPACING_AGAIN_MM, device=device)
 
 
 def test_surface_of_vertices_lies_near_the_mesh_they_came_from(torus_twice):
@@ -182,8 +189,9 @@ def test_surface_of_vertices_lies_near_the_mesh_they_came_from(torus_twice):
     first, again = torus_twice
     assert_closed(again, first.quality().components)
     assert again.quality().volume_ml == pytest.approx(first.quality().volume_ml, rel=0.03)  # measured 0.016
-    there, back = (cKDTree(a.vertices).query(b.vertices)[0] for a, b in ((again, first), (first, again)))
-    assert np.percentile(np.concatenate([there, back]), 95) <= 0.7 * 0.9  # of the spacing
+    there, _ = cKDTree(again.vertices).query(first.vertices)
+    back, _ = cKDTree(first.vertices).query(again.vertices)
+    assert np.percentile(np.concatenate([there, back]), 95) <= 0.7 * SPACING_AGAIN_MM
 
 
 def test_surface_of_vertices_keeps_the_certificate_of_their_cloud(torus_twice):
@@ -192,10 +200,13 @@ def test_surface_of_vertices_keeps_the_certificate_of_their_cloud(torus_twice):
 
 
 def test_normals_of_four_times_the_length_give_the_same_surface(device):
-    cloud = sphere_cloud(2000, 8.0)
+    cloud = sphere_cloud(2000, radius=8.0)
     long_normals = cloud.changed(normals=4.0 * cloud.normals)
-    expected, found = (reconstruct_surface(each, 0.65, device=device) for each in (cloud, long_normals))
+    expected, found = (reconstruct_surface(each, SPACING_MM, device=device) for each in (cloud, long_normals))
     assert np.allclose(found.vertices, expected.vertices, atol=1e-5)  # mm, float32
+
+
+CLOUD = sphere_cloud(500, radius=5.0)
 
 
 @pytest.mark.parametrize(
@@ -216,10 +227,7 @@ def test_normals_of_four_times_the_length_give_the_same_surface(device):
 )
 def test_lengths_that_cannot_be_used_are_refused(device, change, words):
     with pytest.raises(UsageError, match=words):
-        reconstruct_surface(sphere_cloud(500, 5.0), **{"spacing": 0.65, "device": device, **change})
-
-
-CLOUD = sphere_cloud(500, 5.0)
+        reconstruct_surface(CLOUD, **{"spacing": 0.65, "device": device, **change})
 
 
 @pytest.mark.parametrize(
@@ -235,7 +243,7 @@ CLOUD = sphere_cloud(500, 5.0)
 )
 def test_clouds_that_cannot_be_used_are_refused(device, wrong, words):
     with pytest.raises(UsageError, match=words):
-        reconstruct_surface(wrong, 0.65, device=device)
+        reconstruct_surface(wrong, SPACING_MM, device=device)
 
 
 def test_cloud_of_points_that_are_not_finite_is_refused():

@@ -24,23 +24,26 @@ def test_chosen_points_equal_the_twin(device, n, spacing):
 @pytest.mark.oclgrind
 def test_thinned_points_of_a_small_cloud_equal_the_twin(device):
     points = scattered_points(600)
-    assert np.array_equal(choose_points(device, plan_grid(points, 3.0)), twin.choose_points(points, 3.0))
+    assert np.array_equal(choose_points(device, plan_grid(points, edge=3.0)), twin.choose_points(points, spacing=3.0))
 
 
 def test_the_point_nearest_to_the_mean_of_its_cell_stays_and_of_equally_near_ones_the_first(device):
     """The mean of the four is (0.4375, 0.125, 0): the third and fourth are equally near, the others farther away."""
     cell = np.array([(0, 0.125, 0), (0.75, 0.125, 0), (0.5, 0.25, 0), (0.5, 0, 0)], np.float32)
     fourth_before_third, as_listed = cell[[0, 3, 1, 2]], cell + np.float32((7, 0, 0))
-    step = thin_points(np.concatenate([fourth_before_third, as_listed]), 1.0, device=device)
+    step = thin_points(np.concatenate([fourth_before_third, as_listed]), spacing=1.0, device=device)
     assert np.flatnonzero(step.removed == 0).tolist() == [1, 4 + 2]
+
+
+SPACING_MM = 2.5
 
 
 @pytest.fixture(scope="module")
 def thinned_cloud(device):
-    """A cloud of 5000 points with HU, labels and a report, and what a spacing of 2.5 mm leaves of it."""
+    """A cloud of 5000 points with HU, labels and a report, and what thinning leaves of it."""
     hu = np.arange(5000, dtype=np.float32)
     cloud = PointCloud(scattered_points(5000), hu=hu, labels=np.arange(5000), report={"iso_value_hu": 226.0})
-    return cloud, thin_points(cloud, 2.5, device=device)
+    return cloud, thin_points(cloud, SPACING_MM, device=device)
 
 
 def test_thinned_cloud_keeps_the_order_of_its_points_with_their_hu_and_labels(thinned_cloud):
@@ -60,7 +63,7 @@ def test_thinned_cloud_keeps_its_report(thinned_cloud):
 def test_points_removed_by_thinning_are_counted_with_the_spacing(thinned_cloud):
     cloud, step = thinned_cloud
     assert step.counts == {"thinned": len(cloud) - len(step.cloud)}
-    assert step.as_dict()["spacing_mm"] == 2.5
+    assert step.as_dict()["spacing_mm"] == SPACING_MM
 
 
 def test_every_occupied_cell_keeps_one_point(device):
@@ -77,13 +80,13 @@ def test_every_occupied_cell_keeps_one_point(device):
 
 def test_thinning_keeps_points_far_from_the_origin_exact(device):
     points = scattered_points(500).astype(np.float64) + (1e5, 2e5, -1e5)
-    step = thin_points(PointCloud(points), 5.0, device=device)
+    step = thin_points(PointCloud(points), spacing=5.0, device=device)
     assert step.cloud.points.dtype == np.float64
     assert np.array_equal(step.cloud.points, points[step.removed == 0])
 
 
 def test_thinning_keeps_one_of_equal_points(device):
-    assert len(thin_points(np.zeros((9000, 3), np.float32), 1.0, device=device).cloud) == 1
+    assert len(thin_points(np.zeros((9000, 3), np.float32), spacing=1.0, device=device).cloud) == 1
 
 
 @pytest.mark.parametrize("spacing", [0.0, -1.0, np.nan, np.inf, "2"])
@@ -94,14 +97,14 @@ def test_spacings_that_are_no_length_are_refused(spacing):
 
 def test_thinning_of_an_empty_cloud_is_refused():
     with refused(UsageError, "cloud", "empty"):
-        thin_points(np.zeros((0, 3)), 1.0)
+        thin_points(np.zeros((0, 3)), spacing=1.0)
 
 
 def test_spacing_that_needs_too_many_cells_is_refused(device):
     with refused(UsageError, "cells", 0.0001):
-        thin_points(scattered_points(10), 1e-4, device=device)
+        thin_points(scattered_points(10), spacing=1e-4, device=device)
 
 
 def test_too_little_memory_for_thinning_is_refused(device):
     with refused(DeviceMemoryError, "cloud", 1_000_000):
-        thin_points(scattered_points(50_000), 1.0, device=device, memory=1_000_000)
+        thin_points(scattered_points(50_000), spacing=1.0, device=device, memory=1_000_000)
