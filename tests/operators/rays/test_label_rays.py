@@ -22,14 +22,16 @@ from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip
 
 SIZE = (40, 36)
-UNLIT = Lighting(1.0, 0.0, 0.0)
+UNLIT = Lighting(ambient=1.0, diffuse=0.0, specular=0.0)
+BYTES_A_PIXEL = 44  # of buffers of a picture
 NAMES = {1: "vertebrae_L1", 2: "vertebrae_L2", 3: "rib_left_1"}
 RED, BLUE = np.array([255.0, 0.0, 0.0]), np.array([0.0, 0.0, 255.0])
 
 
 def cast_labels(
-    device, volume: Volume, camera: Camera, labels: dict[str, Any] | None, memory=None, size=SIZE, **settings
+    device, volume: Volume, camera: Camera, labels: dict[str, Any] | None, *, memory=None, size=SIZE, **settings
 ) -> Rendering:
+    """The surface at 300 HU with `label_options`, without light and white unless `settings` say otherwise."""
     style = SurfaceLook(300.0, **{"lighting": UNLIT, "color": "white", **(labels or {}), **settings})
     resident = DeviceVolume(volume, device=device, memory=memory)
     return cast_surface(resident, style, Shot(camera, size), 0.5 * min(volume.spacing))
@@ -43,7 +45,8 @@ def two_balls(grid: str, gap: float = 2.0) -> tuple[Volume, LabelMap]:
     """Label 1, a ball of 4 mm in front (smaller y), and behind it 2, one of 6 mm; `gap` mm apart."""
     fields = [lambda p: 4.0 - np.linalg.norm(p + (0, 4.0 + gap / 2, 0), axis=-1)]
     fields += [lambda p: 6.0 - np.linalg.norm(p - (0, 6.0 + gap / 2, 0), axis=-1)]
-    volume = make_volume(lambda p: 300.0 + 60.0 * np.maximum(*(field(p) for field in fields)), grid, 32.0, np.int16)
+    values = lambda p: 300.0 + 60.0 * np.maximum(*(field(p) for field in fields))  # noqa: E731
+    volume = make_volume(values, grid, extent=32.0, dtype=np.int16)
     front, back = (field(positions(volume)) > -0.8 for field in fields)
     return volume, LabelMap(np.where(front, 1, np.where(back, 2, 0)).astype(np.uint8), volume.affine, NAMES)
 
@@ -69,7 +72,7 @@ def depth_of_ball(camera: Camera, centre: np.ndarray, radius: float) -> np.ndarr
 def balls_behind_each_other(request):
     """Two balls on a grid, a camera before them, the depths of both by analysis, and the pixels that both cover."""
     volume, labels = two_balls(request.param)
-    camera = look(volume, (0.0, 1.0, 0.1), 8.0)
+    camera = look(volume, (0.0, 1.0, 0.1), half_height=8.0)
     front, back = (depth_of_ball(camera, centre_of(volume) + (0, y, 0), r) for y, r in ((-5.0, 4.0), (7.0, 6.0)))
     both = np.isfinite(front) & np.isfinite(back)
     assert both.sum() > 60  # enough pixels to judge: measured 162
@@ -82,7 +85,7 @@ OPACITIES = pytest.mark.parametrize("opacity", [1.0, 0.25, 0.0], ids=["opaque", 
 @OPACITIES
 def test_colour_of_a_label_is_mixed_with_that_behind_by_its_opacity(device, balls_behind_each_other, opacity):
     volume, labels, camera, _, _, both = balls_behind_each_other
-    options = label_options(labels, {"L1": "red", "L2": "blue"}, {"L1": opacity})
+    options = label_options(labels, colors={"L1": "red", "L2": "blue"}, opacity={"L1": opacity})
     image = cast_labels(device, volume, camera, options).image[both]
     assert np.abs(image[:, :3] - (opacity * RED + (1.0 - opacity) * BLUE)).max() <= tolerances.RAY_SAME_255
     assert (image[:, 3] == 255).all()
@@ -91,7 +94,7 @@ def test_colour_of_a_label_is_mixed_with_that_behind_by_its_opacity(device, ball
 @OPACITIES
 def test_depth_of_a_label_is_that_of_the_first_that_is_seen(device, balls_behind_each_other, opacity):
     volume, labels, camera, front, back, both = balls_behind_each_other
-    found = cast_labels(device, volume, camera, label_options(labels, None, {"L1": opacity}))
+    found = cast_labels(device, volume, camera, label_options(labels, opacity={"L1": opacity}))
     first_seen = back if opacity == 0.0 else front
     limit = tolerances.SURFACE_RAY_VOXEL * max(volume.spacing)
     assert np.abs(found.depth - first_seen)[both].max() <= limit
@@ -102,8 +105,8 @@ def test_depth_of_a_label_is_that_of_the_first_that_is_seen(device, balls_behind
 def balls_side_by_side(device):
     """A ball of label 1 with an opacity of 0.4 beside an opaque one, and both as one surface without labels."""
     volume, labels = two_balls("even")
-    camera = look(volume, (1.0, 0.0, 0.0), 12.0)
-    found = cast_labels(device, volume, camera, label_options(labels, {}, {"L1": 0.4}))
+    camera = look(volume, (1.0, 0.0, 0.0), half_height=12.0)
+    found = cast_labels(device, volume, camera, label_options(labels, colors={}, opacity={"L1": 0.4}))
     return found, cast_labels(device, volume, camera, None)
 
 
@@ -123,9 +126,9 @@ def test_labels_without_colours_keep_the_colour_of_the_picture(balls_side_by_sid
 def test_border_of_a_label_whose_neighbour_is_hidden_is_seen_head_on_half_way_between_their_voxels(device):
     """Rays run along +y: label 2 begins half way between rows 9 and 10; the camera is 200 mm before row 11.5."""
     volume, labels = two_blocks()
-    options = label_options(labels, {"L1": "red", "L2": "blue"}, {"L1": 0.0})
-    camera = look(volume, (0.0, 1.0, 0.0), 8.0)
-    found = cast_labels(device, volume, camera, options, lighting=Lighting(0.2, 0.8, 0.0))
+    options = label_options(labels, colors={"L1": "red", "L2": "blue"}, opacity={"L1": 0.0})
+    camera = look(volume, (0.0, 1.0, 0.0), half_height=8.0)
+    found = cast_labels(device, volume, camera, options, lighting=Lighting(ambient=0.2, diffuse=0.8, specular=0.0))
     border = np.abs(found.depth - (200.0 + 9.5 - 11.5)) <= 0.5
     assert border.sum() > 400  # measured 432
     inner = border.copy()  # two pixels from its edge
@@ -138,7 +141,7 @@ def test_border_of_a_label_whose_neighbour_is_hidden_is_seen_head_on_half_way_be
 def blocks_of_bone(device):
     """Two blocks in the colour of bone: a function of label options, and the picture without labels."""
     volume, labels = two_blocks()
-    camera = look(volume, (0.1, 1.0, -0.2), 10.0)
+    camera = look(volume, (0.1, 1.0, -0.2), half_height=10.0)
 
     def take(colors):
         return cast_labels(device, volume, camera, label_options(labels, colors), color="bone").image
@@ -162,7 +165,7 @@ def test_colour_of_a_label_changes_its_pixels_alone(blocks_of_bone):
 def test_labels_of_a_grid_half_as_fine_colour_most_pixels_of_the_same_surface_alike(device):
     volume, labels = two_blocks()
     coarse = LabelMap(labels.voxels[::2, ::2, ::2], np.diag([2.0, 2.0, 2.0, 1.0]), NAMES)
-    camera, colors = look(volume, (0.1, 1.0, -0.2), 10.0), {"L1": "red", "L2": "blue"}
+    camera, colors = look(volume, (0.1, 1.0, -0.2), half_height=10.0), {"L1": "red", "L2": "blue"}
     by_fine, by_coarse = (cast_labels(device, volume, camera, label_options(each, colors)) for each in (labels, coarse))
     assert np.array_equal(by_fine.depth, by_coarse.depth, equal_nan=True)
     assert (by_fine.image == by_coarse.image).all(axis=-1).mean() > 0.8  # but the borders of labels
@@ -170,16 +173,17 @@ def test_labels_of_a_grid_half_as_fine_colour_most_pixels_of_the_same_surface_al
 
 def test_shadow_of_a_label_with_an_opacity_of_a_half_is_half_as_dark(device):
     volume, labels = two_balls("even", gap=3.0)
-    camera = look(volume, (1.0, 1.0, 0.0), 12.0)
+    camera = look(volume, (1.0, 1.0, 0.0), half_height=12.0)
     ambient = 0.2
-    light = Lighting(ambient, 0.8, 0.0, direction=(0.0, -1.0, 0.0))
+    light = Lighting(ambient, diffuse=0.8, specular=0.0, direction=(0.0, -1.0, 0.0))
 
-    def take_red(opacity, shadows):
-        options = label_options(labels, {}, {"L1": opacity})
+    def take_red(*, opacity, shadows):
+        options = label_options(labels, colors={}, opacity={"L1": opacity})
         found = cast_labels(device, volume, camera, options, lighting=light, shadows=shadows)
         return found.image[..., 0].astype(float)
 
-    in_shadow, lit, half = take_red(1.0, True), take_red(1.0, False), take_red(0.5, True)
+    in_shadow, lit = (take_red(opacity=1.0, shadows=shadows) for shadows in (True, False))
+    half = take_red(opacity=0.5, shadows=True)
     dark = (in_shadow == ambient * 255) & (lit > 150)  # of the ball behind
     assert dark.sum() > 20  # measured 75
     assert np.median(np.abs(half - 0.5 * (in_shadow + lit))[dark]) <= tolerances.RAY_SAME_255
@@ -188,11 +192,11 @@ def test_shadow_of_a_label_with_an_opacity_of_a_half_is_half_as_dark(device):
 @pytest.mark.parametrize("towards", [(0.2, 0.3, 1.0), (0.1, 1.0, 0.2)], ids=["across slices", "along slices"])
 def test_slabs_give_the_picture_of_translucent_labels_of_the_whole(device, towards):
     volume, labels = two_balls("oblique")
-    camera, options = look(volume, towards, 10.0, True), label_options(labels, None, {"L1": 0.3, "L2": 0.6})
-    bytes_a_pixel = 44
-    memory = bytes_a_pixel * SIZE[0] * SIZE[1] + volume.voxels.nbytes * 3 // 5
+    camera = look(volume, towards, half_height=10.0, perspective=True)
+    options = label_options(labels, opacity={"L1": 0.3, "L2": 0.6})
+    memory = BYTES_A_PIXEL * SIZE[0] * SIZE[1] + volume.voxels.nbytes * 3 // 5
     whole = cast_labels(device, volume, camera, options)
-    parts = cast_labels(device, volume, camera, options, memory)
+    parts = cast_labels(device, volume, camera, options, memory=memory)
     assert parts.report["slabs"] > 2
     away = np.abs(premultiplied(whole.image) - premultiplied(parts.image)).max(axis=-1)
     assert (away <= tolerances.RAY_SAME_255).mean() >= 1.0 - tolerances.SURFACE_TWIN_SHARE
@@ -202,10 +206,10 @@ def test_slabs_give_the_picture_of_translucent_labels_of_the_whole(device, towar
 @pytest.mark.oclgrind
 def test_small_surface_of_labels_clipped_and_in_shadow_is_seen(device):
     volume, labels = two_blocks()
-    style = label_options(labels, None, {"L1": 0.3, "L2": 0.6})
+    style = label_options(labels, opacity={"L1": 0.3, "L2": 0.6})
     clip = Clip.plane(centre_of(volume), (0.0, 0.5, 1.0))
     found = cast_labels(
-        device, volume, look(volume, (0.1, 1.0, -0.3), 8.0), style, size=(12, 9), clip=clip, shadows=True,
+        device, volume, look(volume, (0.1, 1.0, -0.3), half_height=8.0), style, size=(12, 9), clip=clip, shadows=True,
         lighting=Lighting(direction=(0.5, -0.5, 1.0)),
     )  # fmt: skip
     assert 20 < (found.image[..., 3] > 0).sum()  # measured 31 of 108
@@ -218,7 +222,8 @@ def unlabelled_block(device):
     camera = Camera.fit(volume, "anterior")
 
     def take(opacity):
-        return cast_labels(device, volume, camera, label_options(labels, {1: "red", 2: "blue"}, opacity)).image
+        options = label_options(labels, colors={1: "red", 2: "blue"}, opacity=opacity)
+        return cast_labels(device, volume, camera, options).image
 
     whole = take(None)
     white = (whole[..., :3].min(axis=-1) > 200) & (whole[..., 3] > 0)
@@ -249,7 +254,7 @@ def holey_mask(request, device):
     """
     volume, labels = two_balls(request.param)
     numbers = np.where(np.random.default_rng(5).random(labels.voxels.shape) < 0.4, 0, labels.voxels).astype(np.uint8)
-    camera = look(volume, (0.3, 1.0, 0.2), 12.0)
+    camera = look(volume, (0.3, 1.0, 0.2), half_height=12.0)
     options = label_options(LabelMap(numbers, volume.affine, NAMES), {"L1": "red", "L2": "blue"})
     found = cast_labels(device, volume, camera, options)
 
@@ -280,16 +285,16 @@ def test_nearly_every_hit_has_a_label_although_the_mask_lacks_voxels(holey_mask)
 @pytest.fixture(params=["even", "oblique"])
 def red_ball(request, device):
     """A ball of 8 mm by volume rendering, whole and in slabs, whose red label ends at 7 mm, before the bone."""
-    volume = make_volume(lambda p: 300.0 + 60.0 * (8.0 - np.linalg.norm(p, axis=-1)), request.param, 26.0, np.int16)
+    values = lambda p: 300.0 + 60.0 * (8.0 - np.linalg.norm(p, axis=-1))  # noqa: E731
+    volume = make_volume(values, request.param, extent=26.0, dtype=np.int16)
     mask = (np.linalg.norm(positions(volume), axis=-1) < 7.0).astype(np.uint8)
     bone = TransferFunction([(299.0, 1, 1, 1, 0.0), (301.0, 1, 1, 1, 0.6), (2000.0, 1, 1, 1, 0.6)])
     labels = LabelMap(mask, volume.affine)
     style = VolumeLook(bone, lighting=UNLIT, labels=labels, label_colors={1: "red"})
-    shot = Shot(look(volume, (0.3, 1.0, 0.2), 10.0), SIZE)
-    memory = 44 * SIZE[0] * SIZE[1] + volume.voxels.nbytes  # 44 bytes a pixel; labels do not fit beside it
-    return [
-        take_picture(DeviceVolume(volume, device=device, memory=limit), style, shot, 0.3) for limit in (None, memory)
-    ]
+    shot = Shot(look(volume, (0.3, 1.0, 0.2), half_height=10.0), SIZE)
+    memory = BYTES_A_PIXEL * SIZE[0] * SIZE[1] + volume.voxels.nbytes  # labels do not fit beside it
+    residents = (DeviceVolume(volume, device=device, memory=limit) for limit in (None, memory))
+    return [take_picture(resident, style, shot, ray_step=0.3) for resident in residents]
 
 
 def test_volume_rendering_leaves_no_fringe_around_a_label_that_ends_before_the_bone(red_ball):
