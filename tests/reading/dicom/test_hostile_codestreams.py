@@ -36,6 +36,8 @@ def cut_end(data):
     return data[:-2] + b"\0\0"
 
 
+# In the head of a JPEG 2000 codestream: columns and rows at byte 8, components at 40, bits at 42, sampling at 43.
+# In that of an RLE frame: the number of segments, and then the start of each.
 @pytest.mark.fault_row(38, 40)
 @pytest.mark.parametrize(
     ("name", "spoil", "words"),
@@ -55,7 +57,11 @@ def cut_end(data):
         ("RLE", lambda d: struct.pack("<L", 3) + d[4:], "has 3 segments, 2 expected"),
         ("RLE", lambda d: d[:8] + struct.pack("<L", 10**9) + d[12:], "damaged table of segments"),
         ("RLE", lambda d: d[:4] + struct.pack("<L", 0) + d[8:], "damaged table of segments"),
-        ("RLE", lambda d: d[: struct.unpack("<L", d[8:12])[0] + 10], "truncated: an RLE segment of 10 bytes for 1395"),
+        (
+            "RLE",
+            lambda d: d[: struct.unpack("<L", d[8:12])[0] + 10],
+            f"an RLE segment of 10 bytes for {ROWS * COLUMNS}",
+        ),
         ("RLE", lambda d: d[:-200], "do not decode"),
     ],
 )
@@ -73,7 +79,7 @@ def test_codestream_far_too_small_for_its_size_is_refused(tmp_path):
     data = data[:8] + struct.pack(">2L", 65535, 65535) + data[16:]
     frame_bytes, most_times = 65535 * 65535 * 2, 1000
     with refused(RefusedInputError, frame_bytes, most_times):
-        stored.read_codestream(data, JPEG + "90", 65535, 65535, 16)
+        stored.read_codestream(data, JPEG + "90", rows=65535, columns=65535, bits_allocated=16)
 
 
 def test_codestream_of_air_alone_is_decoded_though_it_is_small(tmp_path):
@@ -91,12 +97,12 @@ def test_frame_with_random_damage_is_refused_or_decodes_to_its_size_and_harms_no
     damaged = []
     for _ in range(20):
         frame = bytearray(good)
-        for where in random.integers(0, len(frame), 8):
-            frame[where] = random.integers(256)
+        for position in random.integers(0, len(frame), size=8):
+            frame[position] = random.integers(256)
         damaged.append(bytes(frame))
     path = tmp_path / "pixels"
     path.write_bytes(item(b"") + b"".join(map(item, [good, *damaged])) + END)
-    headers = make_headers(path, syntax, 21)
+    headers = make_headers(path, syntax, frames=1 + len(damaged))
 
     refusals = 0
     with StoredPixels(headers) as source:

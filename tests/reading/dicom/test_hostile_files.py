@@ -13,7 +13,7 @@ from refusals import refused
 from clrecon.errors import RefusedInputError
 from clrecon.reading import read_volume
 
-PLAN = {"shape": (3, 3, 4), "name": "{}".format}
+PLAN = {"shape": (3, 3, 4), "name": "{}".format}  # files 0, 1 and 2
 
 
 @pytest.mark.parametrize("depth", [300, 5000])
@@ -28,7 +28,8 @@ def test_deeply_nested_sequences_are_refused(tmp_path, depth):
     (tmp_path / "1").write_bytes(whole[:start] + opening * depth + closing * depth + whole[start:])
     for name in ("0", "2"):
         (tmp_path / name).unlink()
-    with refused(RefusedInputError, 1, "sequences"):
+    file_name = "1"
+    with refused(RefusedInputError, file_name, "sequences"):
         read_volume(tmp_path)
 
 

@@ -114,7 +114,7 @@ def test_corrupt_files_beside_many_series_are_described_by_the_first_five_in_eac
 
 
 def test_of_files_that_are_no_dicom_only_the_start_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_series(tmp_path)  # 7 slices
+    plan = write_series(tmp_path)
     for k in range(100):
         (tmp_path / f"{k}.png").write_bytes(b"\x89PNG" + bytes(100_000))
     lengths_read: list[int] = []
@@ -127,12 +127,13 @@ def test_of_files_that_are_no_dicom_only_the_start_is_read(tmp_path: Path, monke
 
     monkeypatch.setattr(os, "read", count_bytes)
     assert scan_path(tmp_path).skipped == {"not DICOM": 100}
-    assert len(lengths_read) == 7 + 100
+    assert len(lengths_read) == plan.shape[0] + 100
     assert max(lengths_read) <= PREFIX_BYTES
 
 
 @pytest.fixture
 def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A disk is given up after 0.1 s without an answer, not after minutes."""
     monkeypatch.setattr(disk, "DiskReader", partial(disk.DiskReader, notice_s=0.02, give_up_s=0.1))
 
 
@@ -140,7 +141,7 @@ def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_series_with_a_file_whose_disk_does_not_answer_is_refused_by_its_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, hurried: None
 ) -> None:
-    write_series(tmp_path)
+    plan = write_series(tmp_path)
     answer = threading.Event()
 
     def hang(file: str, limit: int = PREFIX_BYTES) -> disk.FileStart:
@@ -155,7 +156,8 @@ def test_series_with_a_file_whose_disk_does_not_answer_is_refused_by_its_name(
             read_volume(tmp_path, progress=lambda *call: calls.append(call))
     finally:
         answer.set()
-    assert ("no answer yet from slice003.dcm", 0, 7) in calls
+    files_read, files = 0, plan.shape[0]
+    assert ("no answer yet from slice003.dcm", files_read, files) in calls
 
 
 @pytest.mark.fault_row(46)
@@ -246,7 +248,7 @@ def test_error_in_the_thread_of_a_disk_reader_reaches_its_caller() -> None:
 def test_headers_of_a_plain_series_are_parsed_by_the_plain_parser_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write_series(tmp_path)  # 7 slices
+    plan = write_series(tmp_path)
     answers = []
     parse = plain.parse_plainly
 
@@ -255,6 +257,6 @@ def test_headers_of_a_plain_series_are_parsed_by_the_plain_parser_alone(
         return answers[-1]
 
     monkeypatch.setattr("clrecon.reading.dicom.parse.elements.parse_plainly", watch)
-    assert len(scan_path(tmp_path).slices) == 7
-    assert len(answers) == 7
+    assert len(scan_path(tmp_path).slices) == plan.shape[0]
+    assert len(answers) == plan.shape[0]
     assert None not in answers  # None leaves a header to the careful parser

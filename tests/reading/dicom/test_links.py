@@ -27,6 +27,7 @@ def move_out(folder, names, store):
 
 @pytest.fixture
 def plan(tmp_path):
+    """A series of 9 slices in the folder ct."""
     return write_series(tmp_path / "ct", Plan(shape=(9, 5, 6)))
 
 
@@ -117,7 +118,7 @@ def test_link_to_a_folder_apart_from_slices_is_skipped_with_a_warning(tmp_path, 
 def test_series_in_a_folder_behind_a_link_is_read_where_links_are_followed(tmp_path, plan, other, place):
     root = link_other(tmp_path, place)
     assert [series.slices for series in list_series(root, follow_links=True).series] == [9, 7]
-    assert np.array_equal(read_volume(root, 2, follow_links=True).voxels, other.hu())
+    assert np.array_equal(read_volume(root, series=2, follow_links=True).voxels, other.hu())
 
 
 def test_followed_links_that_lead_back_are_left_and_no_file_is_read_twice(tmp_path, plan):

@@ -100,8 +100,8 @@ OTHER_SERIES = pytest.mark.parametrize(
 
 
 def write_beside_other_series(folder, change):
-    """A series, and in a folder beside it another series with a corrupt file."""
-    plan = write_series(folder / "ct")
+    """A series of 7 slices, and in a folder beside it another series of 3 with a corrupt file."""
+    plan = write_series(folder / "ct", Plan(shape=(7, 5, 6)))
     write_series(folder / "other", Plan(series=2, shape=(3, 5, 6)), change)
     (folder / "other" / "bad").write_bytes(CORRUPT)
     return plan
@@ -112,7 +112,7 @@ def test_corrupt_file_among_slices_of_another_series_is_skipped_with_a_warning(t
     plan = write_beside_other_series(tmp_path, change)
     volume = read_volume(tmp_path)
     assert np.array_equal(volume.voxels, plan.hu())
-    assert volume.report["files"] == {"found": 11, "used": 7, "skipped": {"corrupt": 1}}
+    assert volume.report["files"] == {"found": 7 + 3 + 1, "used": 7, "skipped": {"corrupt": 1}}
     assert volume.report["warnings"][0] == "1 corrupt file skipped"
 
 

@@ -16,12 +16,16 @@ from clrecon.reading import list_series, read_volume
 from clrecon.reading.common.likeness import judge_slices, measure_likeness
 from clrecon.reading.dicom.stack.mixtures import alternates
 
-GAP = 1.25
-EACH = 12
+GAP = 1.25  # mm between the slices of one volume
+EACH = 12  # slices of one volume
+STEP_HU = 300  # between the pixels of a volume and those of the next
 
 
 def write_volumes(folder, *elements, offsets=None, slices=None, pixels=None, per_slice=0):
-    """A volume for each mapping of elements (values, or functions of its own slice), a part of a gap apart."""
+    """A volume for each mapping of elements (values, or functions of its own slice), a part of a gap apart.
+
+    `pixels` are the stored values by volume and slice; else each volume is `STEP_HU` above the one before.
+    """
     plans = []
     count = len(elements)
     for number, own in enumerate(elements):
@@ -30,7 +34,7 @@ def write_volumes(folder, *elements, offsets=None, slices=None, pixels=None, per
         plan = Plan(shape=shape, name=f"{number}-{{:03d}}".format, gap=GAP, origin=(-12.5, 31.25, -400 + along))
 
         def change(ds, k, number=number, own=own, plan=plan):
-            stored = plan.stored(k) + 300 * number if pixels is None else pixels(number, k)
+            stored = plan.stored(k) + STEP_HU * number if pixels is None else pixels(number, k)
             ds.PixelData = stored.astype("i2").tobytes()
             ds.SOPInstanceUID += f".{number}"
             ds.InstanceNumber = k + 1
@@ -89,9 +93,9 @@ def test_two_volumes_that_an_element_tells_apart_are_refused_with_their_list(tmp
     write_volumes(tmp_path, first, second)
     refusal = read_refusal(tmp_path)
     assert f"2 phases whose slices lie between each other, choose one with phase: [1: {keyword} " in refusal
-    assert "12 slices], [2:" in refusal
+    assert f"{EACH} slices], [2:" in refusal
     assert "DOE" not in refusal
-    assert refusal.endswith("; slices of phase 1 lie 1.25 mm apart, those of all phases 0.625 mm")
+    assert refusal.endswith(f"; slices of phase 1 lie {GAP} mm apart, those of all phases {GAP / 2} mm")
 
 
 @TWO_VALUES
@@ -99,7 +103,7 @@ def test_each_of_two_volumes_between_each_other_is_read_by_its_phase(tmp_path, f
     plans = write_volumes(tmp_path, first, second)
     for number, plan in enumerate(plans):
         volume = read_volume(tmp_path, phase=number + 1)
-        assert np.array_equal(volume.voxels, plan.hu() + 300 * number)
+        assert np.array_equal(volume.voxels, plan.hu() + STEP_HU * number)
         index = (2, 3, 4)
         assert volume.ijk_to_lps([index])[0] == pytest.approx(plan.truth([index])[0], abs=tolerances.AFFINE_MM)
 
@@ -109,14 +113,14 @@ def test_report_of_a_phase_says_what_was_left_and_holds_no_text_of_the_files(tmp
     write_volumes(tmp_path, first, second)
     report = read_volume(tmp_path, phase=2).report
     assert report["warnings"][0].endswith(
-        "12 slices of others left: slices of phase 2 lie 1.25 mm apart, those of all phases 0.625 mm"
+        f"{EACH} slices of others left: slices of phase 2 lie {GAP} mm apart, those of all phases {GAP / 2} mm"
     )
     assert not re.search("IODINE|DOE", repr(report))
 
 
 def test_volume_without_the_element_that_another_has_is_listed_as_none(tmp_path):
     write_volumes(tmp_path, {}, {"ContrastBolusAgent": "IODINE"})
-    assert "[1: ContrastBolusAgent (none), 12 slices]" in read_refusal(tmp_path)
+    assert f"[1: ContrastBolusAgent (none), {EACH} slices]" in read_refusal(tmp_path)
 
 
 def test_third_phase_of_two_volumes_is_refused(tmp_path):
@@ -167,8 +171,8 @@ def test_element_that_changes_along_one_volume_does_not_part_it(tmp_path, keywor
 
 
 # --- what may alternate within one volume: the pixels decide ---
-def moved_bodies(moved):
-    """A body that widens from slice to slice, moved along its rows in the second volume, and noise."""
+def moved_bodies(*, moved):
+    """A body that widens from slice to slice, `moved` voxels along its rows in the second volume, and noise."""
     y, x = np.mgrid[:64, :64]
 
     def stored(number, k):
@@ -196,30 +200,30 @@ def values_of_both(elements):
 
 @pytest.mark.parametrize("elements", daily(1, DOUBTFUL), ids=["tube current", "window", "private"])
 def test_element_that_may_alternate_parts_volumes_of_unlike_pictures(tmp_path, elements):
-    write_volumes(tmp_path, *values_of_both(elements), pixels=moved_bodies(6))
+    write_volumes(tmp_path, *values_of_both(elements), pixels=moved_bodies(moved=6))
     assert "2 phases whose slices lie between each other" in read_refusal(tmp_path)
     assert read_volume(tmp_path, phase=2).voxels.shape[0] == EACH
 
 
 @pytest.mark.parametrize("elements", daily(1, DOUBTFUL), ids=["tube current", "window", "private"])
 def test_element_that_may_alternate_over_like_pictures_fails_the_gate_of_one_volume_with_a_warning(tmp_path, elements):
-    write_volumes(tmp_path, *values_of_both(elements), pixels=moved_bodies(0))
+    write_volumes(tmp_path, *values_of_both(elements), pixels=moved_bodies(moved=0))
     report = read_volume(tmp_path).report
     assert failed_gates(report) == ["one_volume"]
     assert any("alternates along the stack: maybe several volumes" in warning for warning in report["warnings"])
 
 
 def test_two_passes_numbered_one_after_the_other_with_unlike_pictures_are_refused_as_phases(tmp_path):
-    first, second = {"InstanceNumber": lambda k: k + 1}, {"InstanceNumber": lambda k: k + 13}
-    write_volumes(tmp_path, first, second, pixels=moved_bodies(6))
-    assert "[1: order of InstanceNumber 1, 12 slices]" in read_refusal(tmp_path)
+    first, second = {"InstanceNumber": lambda k: k + 1}, {"InstanceNumber": lambda k: EACH + k + 1}
+    write_volumes(tmp_path, first, second, pixels=moved_bodies(moved=6))
+    assert f"[1: order of InstanceNumber 1, {EACH} slices]" in read_refusal(tmp_path)
 
 
 TO_AND_FRO = ({"RotationDirection": "CW"}, {"RotationDirection": "CC"})
 
 
 def test_slices_of_a_gantry_that_turns_to_and_fro_are_one_volume_without_a_warning(tmp_path):
-    write_volumes(tmp_path, *TO_AND_FRO, pixels=moved_bodies(0))
+    write_volumes(tmp_path, *TO_AND_FRO, pixels=moved_bodies(moved=0))
     volume = read_volume(tmp_path)
     assert volume.voxels.shape[0] == 2 * EACH
     assert volume.report["spacing_mm"][2] == pytest.approx(GAP / 2)
@@ -228,7 +232,7 @@ def test_slices_of_a_gantry_that_turns_to_and_fro_are_one_volume_without_a_warni
 
 
 def test_unlike_pictures_of_a_gantry_that_turns_to_and_fro_are_warned_of(tmp_path):
-    write_volumes(tmp_path, *TO_AND_FRO, pixels=moved_bodies(6))  # every second slice lies 6 voxels aside
+    write_volumes(tmp_path, *TO_AND_FRO, pixels=moved_bodies(moved=6))
     warnings = read_volume(tmp_path).report["warnings"]
     assert any("maybe two volumes between each other" in warning for warning in warnings)
 
@@ -238,20 +242,20 @@ TWO_TABLE_HEIGHTS = ({"TableHeight": 100}, {"TableHeight": 101})
 
 
 def test_element_that_is_not_in_the_table_parts_volumes_of_unlike_pictures(tmp_path):
-    write_volumes(tmp_path, *TWO_TABLE_HEIGHTS, pixels=moved_bodies(6))  # every second slice lies 6 voxels aside
+    write_volumes(tmp_path, *TWO_TABLE_HEIGHTS, pixels=moved_bodies(moved=6))
     refusal = read_refusal(tmp_path)
     assert "2 phases whose slices lie between each other, choose one with phase: [1: TableHeight" in refusal
 
 
 def test_element_that_is_not_in_the_table_fails_the_gate_of_one_volume_over_like_pictures(tmp_path):
-    write_volumes(tmp_path, *TWO_TABLE_HEIGHTS, pixels=moved_bodies(0))
+    write_volumes(tmp_path, *TWO_TABLE_HEIGHTS, pixels=moved_bodies(moved=0))
     report = read_volume(tmp_path).report
     assert failed_gates(report) == ["one_volume"]
     assert any("TableHeight alternates along the stack: maybe several volumes" in text for text in report["warnings"])
 
 
 def test_unlike_pictures_by_turns_fail_the_gate_of_one_volume_with_a_warning(tmp_path):
-    write_volumes(tmp_path, {}, {}, pixels=moved_bodies(6))
+    write_volumes(tmp_path, {}, {}, pixels=moved_bodies(moved=6))
     report = read_volume(tmp_path).report
     assert failed_gates(report) == ["one_volume"]
     words = "less alike than each is to the next but one"
@@ -260,7 +264,7 @@ def test_unlike_pictures_by_turns_fail_the_gate_of_one_volume_with_a_warning(tmp
 
 
 def test_every_second_slice_of_unlike_pictures_is_read_as_a_phase(tmp_path):
-    plan, _ = write_volumes(tmp_path, {}, {}, pixels=moved_bodies(6))
+    plan, _ = write_volumes(tmp_path, {}, {}, pixels=moved_bodies(moved=6))
     chosen = read_volume(tmp_path, phase=1)
     assert chosen.report["phase"] == {"number": 1, "of": 2, "keyword": "place", "value": "1 of 2"}
     index = (0, 0, 3)
@@ -269,7 +273,7 @@ def test_every_second_slice_of_unlike_pictures_is_read_as_a_phase(tmp_path):
 
 
 def test_second_phase_of_one_volume_is_refused(tmp_path):
-    write_volumes(tmp_path, {}, {}, pixels=moved_bodies(0))
+    write_volumes(tmp_path, {}, {}, pixels=moved_bodies(moved=0))
     assert read_volume(tmp_path).report["warnings"] == []
     with refused(UsageError, "slice", "phase", 2):
         read_volume(tmp_path, phase=2)

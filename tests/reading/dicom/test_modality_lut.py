@@ -42,7 +42,8 @@ def test_modality_lut_of_one_slice_fails_the_gate_of_hu_with_a_warning_in_any_en
     write_series(tmp_path, plan, change)
     measured, said = measure_hu_known(tmp_path)
     assert measured == 1
-    assert len(said) == 1 and said[0].endswith("(1 of 7 slices, at -396.25 mm)")
+    _, _, z_mm = plan.position(3)
+    assert len(said) == 1 and said[0].endswith(f"(1 of {plan.shape[0]} slices, at {z_mm:.2f} mm)")
 
 
 def test_modality_lut_without_items_is_not_warned_of(tmp_path):

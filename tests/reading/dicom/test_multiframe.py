@@ -75,10 +75,10 @@ def test_fault_22_frames_lie_where_they_were_written(tmp_path, plan, order):
 
 
 def test_frames_of_one_file_are_counted_as_slices(tmp_path):
-    write_enhanced(tmp_path / "mf")
+    plan = write_enhanced(tmp_path / "mf")
     volume = read_volume(tmp_path)
     assert volume.voxels.dtype == np.int16
-    assert (volume.report["files"]["used"], volume.report["slices"]) == (1, 7)
+    assert (volume.report["files"]["used"], volume.report["slices"]) == (1, plan.shape[0])
 
 
 @pytest.mark.parametrize(
@@ -98,9 +98,10 @@ def test_frames_are_placed_by_groups_that_are_shared_or_per_frame(tmp_path, shar
 def test_fault_22_every_frame_has_its_own_rescale(tmp_path):
     plan = write_enhanced(tmp_path / "mf", Plan(shape=(4, 5, 6)), order=(2, 0, 3, 1), slopes=(1, 2, 3, 4))
     volume = read_volume(tmp_path)
-    expected = np.stack([plan.stored(k).astype(int) * (k + 1) - 1024 for k in range(4)])
+    expected = np.stack([plan.stored(k).astype(int) * (k + 1) + plan.intercept for k in range(4)])
     assert_right(volume, plan, expected)
-    assert volume.report["rescale"] == {"slope": [1.0, 4.0], "intercept": [-1024.0, -1024.0], "type": "HU"}
+    lowest_and_highest_slope, intercepts = [1.0, 4.0], [plan.intercept, plan.intercept]
+    assert volume.report["rescale"] == {"slope": lowest_and_highest_slope, "intercept": intercepts, "type": "HU"}
 
 
 @pytest.mark.parametrize(
@@ -117,7 +118,7 @@ def test_enhanced_images_of_every_uncompressed_encoding_are_read(tmp_path, synta
                     leave_lengths_out(one)
 
     plan = write_enhanced(tmp_path / "mf", Plan(syntax=syntax), leave_lengths_out, order=SHUFFLED, slopes=range(1, 8))
-    expected = np.stack([plan.stored(k).astype(int) * (k + 1) - 1024 for k in range(7)])
+    expected = np.stack([plan.stored(k).astype(int) * (k + 1) + plan.intercept for k in range(7)])
     assert_right(read_volume(tmp_path), plan, expected)
 
 
@@ -143,7 +144,7 @@ def test_frames_in_several_files_are_read_as_one_stack(tmp_path):
         write_enhanced(tmp_path / f"mf{number}", plan, order=order)
     volume = read_volume(tmp_path)
     assert_right(volume, plan)
-    assert (volume.report["files"]["used"], volume.report["slices"]) == (3, 7)
+    assert (volume.report["files"]["used"], volume.report["slices"]) == (3, plan.shape[0])
 
 
 def test_frames_and_single_slices_of_one_series_are_read_as_one_stack(tmp_path):
@@ -165,17 +166,18 @@ def test_single_frame_is_named_by_its_file_alone(tmp_path):
 
 
 def test_padding_value_of_the_file_is_masked_in_its_frames(tmp_path):
-    plan = write_enhanced(tmp_path / "mf", change=lambda ds: setattr(ds, "PixelPaddingValue", 905))
+    padding = 905  # the stored value of one voxel
+    plan = write_enhanced(tmp_path / "mf", change=lambda ds: setattr(ds, "PixelPaddingValue", padding))
     volume = read_volume(tmp_path)
-    (k, j, i), *others = np.argwhere(plan.hu() == 905 - 1024)  # one voxel has that value
+    (k, j, i), *others = np.argwhere(plan.hu() == padding + plan.intercept)
     assert others == []
-    assert volume.voxels[k, j, i] != 905 - 1024
+    assert volume.voxels[k, j, i] != padding + plan.intercept
     assert volume.report["padding_share"] == pytest.approx(1 / plan.hu().size)
 
 
 def test_larger_one_of_a_series_of_frames_and_a_series_of_slices_is_read(tmp_path):
     write_series(tmp_path, Plan(series=1, shape=(5, 5, 6)))
-    plan = write_enhanced(tmp_path / "mf", Plan(series=2))
+    plan = write_enhanced(tmp_path / "mf", Plan(series=2, shape=(7, 5, 6)))
     assert_right(read_volume(tmp_path), plan)
     listing = list_series(tmp_path)
     assert listing.chosen == 2
@@ -186,7 +188,7 @@ def test_larger_one_of_a_series_of_frames_and_a_series_of_slices_is_read(tmp_pat
 
 
 def test_frames_are_named_by_their_file_and_number_from_1(tmp_path):
-    write_enhanced(tmp_path / "mf", order=SHUFFLED)
+    write_enhanced(tmp_path / "mf", order=SHUFFLED)  # 7 frames
     headers = headers_of_ct(tmp_path / "mf")
     assert [header.frame for header in headers] == list(range(7))
     assert [header.name for header in headers] == [f"mf frame {number}" for number in range(1, 8)]
@@ -201,7 +203,7 @@ def write_with_localizer_frames(path):
             frame_type = frame_groups(ds, number).CTImageFrameTypeSequence[0]
             frame_type.FrameType = ["ORIGINAL", "PRIMARY", "LOCALIZER", "NONE"]
 
-    write_enhanced(path, change=spoil, shared=("PixelMeasuresSequence",))
+    write_enhanced(path, Plan(shape=(7, 5, 6)), change=spoil, shared=("PixelMeasuresSequence",))
 
 
 def test_localizer_frames_are_listed_as_another_series(tmp_path):
@@ -221,8 +223,8 @@ def test_frames_of_two_orientations_in_one_file_are_listed_as_two_series(tmp_pat
         for number in (0, 1):
             frame_groups(ds, number).PlaneOrientationSequence[0].ImageOrientationPatient = [0, 1, 0, 0, 0, -1]
 
-    write_enhanced(tmp_path / "mf", change=turn, shared=("PixelMeasuresSequence",))
-    assert [entry.slices for entry in list_series(tmp_path).series] == [5, 2]
+    plan = write_enhanced(tmp_path / "mf", change=turn, shared=("PixelMeasuresSequence",))
+    assert [entry.slices for entry in list_series(tmp_path).series] == [plan.shape[0] - 2, 2]
 
 
 PHASES = {
@@ -334,10 +336,12 @@ def test_element_of_a_frame_goes_before_the_shared_one(tmp_path):
 
 @pytest.mark.parametrize("kind", [None, "US"])
 def test_frames_without_a_rescale_are_in_hu_by_their_real_world_values_with_a_warning(tmp_path, kind):
-    mappings = [real_world(0.1, 7.0, "mg/cm3"), real_world(2.0, -1000.0)]
-    plan = write_enhanced(tmp_path / "mf", change=without_rescale(mappings, kind))
+    to_density = real_world(slope=0.1, intercept=7.0, code="mg/cm3")
+    to_hu = real_world(slope=2.0, intercept=-1000.0)
+    plan = write_enhanced(tmp_path / "mf", change=without_rescale([to_density, to_hu], kind))
     volume = read_volume(tmp_path)
-    assert_right(volume, plan, (plan.hu() + 1024) * 2 - 1000)
+    stored = plan.hu() - plan.intercept
+    assert_right(volume, plan, 2 * stored - 1000)
     assert volume.report["rescale"]["type"] == "HU"
     assert volume.report["warnings"] == [
         ("RescaleType is US" if kind else "no RescaleSlope") + ": HU by RealWorldValueMappingSequence (0040,9096) "
@@ -346,14 +350,16 @@ def test_frames_without_a_rescale_are_in_hu_by_their_real_world_values_with_a_wa
 
 
 def test_rescale_to_hu_goes_before_real_world_values(tmp_path):
-    plan = write_enhanced(tmp_path / "mf", change=without_rescale([real_world(2.0, -1000.0)], "HU"))
+    mappings = [real_world(slope=2.0, intercept=-1000.0)]
+    plan = write_enhanced(tmp_path / "mf", change=without_rescale(mappings, kind="HU"))
     assert_right(read_volume(tmp_path), plan)
 
 
 def test_frames_without_a_rescale_and_values_in_hu_are_kept_with_a_warning(tmp_path):
-    plan = write_enhanced(tmp_path / "mf", change=without_rescale([real_world(0.1, 7.0, "mg/cm3")]))
+    to_density = real_world(slope=0.1, intercept=7.0, code="mg/cm3")
+    plan = write_enhanced(tmp_path / "mf", change=without_rescale([to_density]))
     volume = read_volume(tmp_path)
-    assert np.array_equal(volume.voxels, plan.hu() + 1024)
+    assert np.array_equal(volume.voxels, plan.hu() - plan.intercept)  # as stored
     assert "no RescaleSlope" in volume.report["warnings"][0]
 
 
@@ -365,7 +371,7 @@ def test_intercept_outside_of_the_group_with_the_slope_is_not_used_and_warned_of
 
     plan = write_enhanced(tmp_path / "mf", change=spoil)
     volume = read_volume(tmp_path)
-    assert np.array_equal(volume.voxels, plan.hu() + 1024)
+    assert np.array_equal(volume.voxels, plan.hu() - plan.intercept)  # as stored
     assert "no RescaleIntercept" in volume.report["warnings"][0]
 
 
@@ -373,9 +379,10 @@ def test_lossy_compression_of_one_frame_is_warned_of(tmp_path):
     def spoil(ds):
         frame_groups(ds, 2).UnassignedPerFrameConvertedAttributesSequence = [item(LossyImageCompression="01")]
 
-    write_enhanced(tmp_path / "mf", change=spoil)
+    plan = write_enhanced(tmp_path / "mf", change=spoil)
+    _, _, z_mm = plan.position(2)
     assert read_volume(tmp_path).report["warnings"] == [
-        "lossy compression: the values are not those that were measured (1 of 7 slices, at -397.50 mm)"
+        f"lossy compression: the values are not those that were measured (1 of 7 slices, at {z_mm:.2f} mm)"
     ]
 
 
@@ -385,10 +392,10 @@ def test_computed_frames_are_warned_of(tmp_path):
         frame_type.FrameType = ["DERIVED", "PRIMARY", "VOLUME", "SUBTRACTION"]
         frame_type.VolumeBasedCalculationTechnique = "MAX_IP"
 
-    write_enhanced(tmp_path / "mf", change=spoil, shared=())  # each frame has groups of its own
-    # The second frame lies 1.25 mm above the first, at -400.
+    plan = write_enhanced(tmp_path / "mf", change=spoil, shared=())  # each frame has groups of its own
+    _, _, z_mm = plan.position(1)
     assert read_volume(tmp_path).report["warnings"] == [
-        "computed frames (MAX_IP, SUBTRACTION): maybe not measured HU (1 of 7 slices, at -398.75 mm)"
+        f"computed frames (MAX_IP, SUBTRACTION): maybe not measured HU (1 of 7 slices, at {z_mm:.2f} mm)"
     ]
 
 
@@ -396,6 +403,7 @@ def test_computed_frames_are_warned_of(tmp_path):
 
 
 def write_parts(folder, plan, parts, leave_out=(), change=None, **how):
+    """Write a concatenation as the files part1, part2, ...: the slices `parts[n]` of the plan in each."""
     for number, ds in enumerate(make_concatenation(plan, parts, **how), start=1):
         if change is not None:
             change(ds, number)
