@@ -20,32 +20,32 @@ CENTRE, RADIUS = 19.5, 18.0
 SWEEP = [-2500, -2000, -1500, -1100, *range(-1025, -978, 3), -950, -900, -700, -500, -100, 0, 30, 200, 700, 1500, 3000]
 
 
-def outside_of_circle(shape=SHAPE):
+def outside_of_circle():
     """True outside of the circle of reconstruction, shape (rows, columns)."""
-    y, x = np.ogrid[: shape[1], : shape[2]]
+    y, x = np.ogrid[: SHAPE[1], : SHAPE[2]]
     return (x - CENTRE) ** 2 + (y - CENTRE) ** 2 > RADIUS**2
 
 
-def make_body(air, noise, reach=0.0, seed=1):
+def make_body(*, air, noise, reach=0.0):
     """HU of a body (40) with a bone (900) in air; with `reach` the body goes beyond the circle at low x."""
     y, x = np.mgrid[: SHAPE[1], : SHAPE[2]]
     hu = np.full(SHAPE, float(air))
     hu[:, ((x - CENTRE + reach) / 11) ** 2 + ((y - CENTRE) / 8) ** 2 <= 1] = 40
     hu[:, (x - CENTRE + reach) ** 2 + (y - CENTRE) ** 2 <= 9] = 900
-    return np.rint(hu + np.random.default_rng(seed).normal(0, noise, SHAPE)) if noise else hu
+    return np.rint(hu + np.random.default_rng(1).normal(0, noise, SHAPE)) if noise else hu
 
 
-def write_padded(folder, hu, padding=-2000, declare=True, every=1, plan=None):
-    plan = plan or Plan(shape=SHAPE)
+def write_padded(folder, hu, padding=-2000, every=1):
+    """Slices of HU; in each, or in every second or third, the stored value outside of the circle is `padding`."""
+    plan = Plan(shape=SHAPE)
     outside = outside_of_circle()
 
     def change(ds, k):
         stored = (hu[k] - plan.intercept).astype(np.int16)
         if k % every == 0:
             stored[outside] = padding
-        ds.PixelData = stored.tobytes()
-        if declare and k % every == 0:
             ds.add_new("PixelPaddingValue", "SS", padding)
+        ds.PixelData = stored.tobytes()
 
     write_series(folder, plan, change)
 
@@ -66,7 +66,7 @@ IN_THEORY, IN_SCANS, BELOW_THAT_OF_SCANS, ABOVE_THAT_OF_SCANS = -1000, -994, -10
 
 @pytest.mark.parametrize("air", [IN_THEORY, IN_SCANS, BELOW_THAT_OF_SCANS, ABOVE_THAT_OF_SCANS])
 def test_no_tube_at_any_iso_value_where_air_has_no_noise(tmp_path, air):
-    write_padded(tmp_path, make_body(air, 0))
+    write_padded(tmp_path, make_body(air=air, noise=0))
     volume = read_volume(tmp_path)
     assert volume.report["padding_hu"] == air
     assert volume.report["hu_range"] == [air, 900]
@@ -77,7 +77,7 @@ def test_no_tube_at_any_iso_value_where_air_has_no_noise(tmp_path, air):
 
 @pytest.mark.parametrize("iso_value", [-990, -700, 0, 200])
 def test_no_surface_of_a_padded_body_lies_at_the_circle(tmp_path, iso_value):
-    write_padded(tmp_path, make_body(-994, 0))
+    write_padded(tmp_path, make_body(air=-994, noise=0))
     volume = read_volume(tmp_path)
     vertices = extract_isosurface(volume, iso_value)[0]
     assert len(vertices) > 0
@@ -88,17 +88,18 @@ def test_no_surface_of_a_padded_body_lies_at_the_circle(tmp_path, iso_value):
 
 def test_padding_of_a_fixed_value_would_have_a_tube_at_the_circle(tmp_path):
     """Known bad: what the fill is for."""
-    write_padded(tmp_path, make_body(-994, 0))
+    write_padded(tmp_path, make_body(air=-994, noise=0))
     voxels = read_volume(tmp_path).voxels.copy()
     outside = outside_of_circle()
     voxels[:, outside] = AIR_HU
-    assert crossed_share(voxels, -1010, pairs_between(outside, ~outside)) == 1
+    between_both = -1010  # the fixed value of -1024 and the air of -994
+    assert crossed_share(voxels, between_both, pairs_between(outside, ~outside)) == 1
 
 
 @pytest.mark.parametrize("noise", [5, 12, 40])
 @pytest.mark.parametrize("clipped", [False, True])
 def test_iso_value_in_noisy_air_crosses_the_border_of_padding_no_more_than_the_air(tmp_path, noise, clipped):
-    hu = make_body(-995, noise)
+    hu = make_body(air=-995, noise=noise)
     write_padded(tmp_path, np.maximum(hu, -1024) if clipped else hu)
     volume = read_volume(tmp_path)
     outside = outside_of_circle()
@@ -113,7 +114,7 @@ def test_iso_value_in_noisy_air_crosses_the_border_of_padding_no_more_than_the_a
 @pytest.mark.parametrize("noise", [5, 12, 40])
 @pytest.mark.parametrize("clipped", [False, True])
 def test_padding_beside_noisy_air_is_filled_with_its_middle_hu(tmp_path, noise, clipped):
-    hu = make_body(-995, noise)
+    hu = make_body(air=-995, noise=noise)
     write_padded(tmp_path, np.maximum(hu, -1024) if clipped else hu)
     median_error = noise / 5  # of some hundred voxels beside the circle
     assert read_volume(tmp_path).report["padding_hu"] == pytest.approx(-995, abs=median_error)
@@ -122,7 +123,7 @@ def test_padding_beside_noisy_air_is_filled_with_its_middle_hu(tmp_path, noise, 
 @pytest.mark.parametrize("noise", [0, 12])
 @pytest.mark.parametrize("iso_value", [-500, 200])
 def test_surface_of_a_body_cut_by_the_circle_is_closed_there(tmp_path, noise, iso_value):
-    write_padded(tmp_path, make_body(-1000, noise, reach=14.0))
+    write_padded(tmp_path, make_body(air=-1000, noise=noise, reach=14.0))
     volume = read_volume(tmp_path)
     vertices, _, triangles = extract_isosurface(volume, iso_value)
     edges = np.sort(np.concatenate([triangles[:, pair] for pair in ((0, 1), (1, 2), (2, 0))]), axis=1)
@@ -141,7 +142,7 @@ def test_padding_without_air_beside_it_is_filled_with_the_hu_of_air(tmp_path, in
 
 
 def test_measured_voxels_keep_their_hu_and_padding_gets_one_value(tmp_path):
-    hu = np.maximum(make_body(-995, 20), -1024)
+    hu = np.maximum(make_body(air=-995, noise=20), -1024)
     write_padded(tmp_path, hu)
     volume = read_volume(tmp_path)
     assert np.array_equal(volume.voxels[:, ~outside_of_circle()], hu[:, ~outside_of_circle()])
@@ -150,7 +151,7 @@ def test_measured_voxels_keep_their_hu_and_padding_gets_one_value(tmp_path):
 
 
 def test_slices_that_declare_no_padding_are_measured_whatever_they_hold(tmp_path):
-    write_padded(tmp_path, make_body(-1000, 0), every=2)
+    write_padded(tmp_path, make_body(air=-1000, noise=0), every=2)
     volume = read_volume(tmp_path)
     assert volume.report["padding_share"] == pytest.approx(outside_of_circle().mean() / 2)
     assert (volume.voxels[:, outside_of_circle()] == -1000).all()  # filled like the air that the others have there
@@ -160,20 +161,22 @@ def test_padding_of_slices_with_other_intercepts_is_filled_with_one_hu(tmp_path)
     """Padding is a stored value: its HU would differ with each slice's intercept."""
     plan = Plan(shape=SHAPE)
     outside = outside_of_circle()
+    air, bright, slope = -1001, -961, 0.5
 
     def change(ds, k):
-        stored = np.where(outside, -2000, 2 * (-1001 - (-1024 + k))).astype(np.int16)
-        stored[20, 20] += 80
+        intercept = -1024 + k
+        stored = np.where(outside, -2000, (air - intercept) / slope).astype(np.int16)
+        stored[20, 20] = (bright - intercept) / slope
         ds.PixelData = stored.tobytes()
         ds.add_new("PixelPaddingValue", "SS", -2000)
-        set_values(RescaleSlope=0.5, RescaleIntercept=-1024 + k)(ds, k)
+        set_values(RescaleSlope=slope, RescaleIntercept=intercept)(ds, k)
 
     write_series(tmp_path, plan, change)
     volume = read_volume(tmp_path)
     assert volume.voxels.dtype == np.float32
-    assert volume.report["padding_hu"] == -1001
-    assert (volume.voxels[:, 20, 20] == -961).all()
-    assert np.count_nonzero(volume.voxels != -1001) == len(volume.voxels)
+    assert volume.report["padding_hu"] == air
+    assert (volume.voxels[:, 20, 20] == bright).all()
+    assert np.count_nonzero(volume.voxels != air) == len(volume.voxels)
 
 
 def test_report_of_a_scan_without_padding_has_no_hu_of_padding(tmp_path):
@@ -227,6 +230,6 @@ def test_air_is_sampled_in_slices_along_the_whole_scan(count, step):
     masks = PaddingMasks(voxels)
     for k in range(count):
         masks.add(k, pack_mask(padding))
-    sampled = range(0, count, step)
-    expected = -1000.0 + sampled[(2 * len(sampled) - 1) // 2 // 2]
-    assert masks.fill() == expected and (voxels[:, 0, 0] == expected).all()
+    beside_padding = sorted(2 * [-1000.0 + k for k in range(0, count, step)])  # right and below, in each slice
+    lower_median = beside_padding[(len(beside_padding) - 1) // 2]
+    assert masks.fill() == lower_median and (voxels[:, 0, 0] == lower_median).all()

@@ -14,8 +14,11 @@ from clrecon.reading.dicom.series.phases import have_same_pixels
 from clrecon.reading.dicom.series.scan import scan_path
 
 
-def write_phase(folder, number, shift=0, plan=None, **elements):
-    """A copy of the plan's series with other pixels, and elements that may be functions of the slice."""
+def write_phase(folder, number, *, shift=0, plan=None, **elements):
+    """The 7 slices of 5 x 6 pixels of a `Plan`, or those of another, their HU `shift` higher.
+
+    `elements` of each slice may be functions of its number.
+    """
 
     def change(ds, k):
         ds.PixelData = (np.frombuffer(ds.PixelData, "i2") + shift).tobytes()
@@ -27,7 +30,7 @@ def write_phase(folder, number, shift=0, plan=None, **elements):
 
 
 def test_copies_of_all_slices_are_dropped_with_a_warning(tmp_path):
-    plan = write_series(tmp_path, Plan())
+    plan = write_series(tmp_path, Plan(shape=(7, 5, 6)))
     write_series(tmp_path, Plan(name="again{}".format), set_values(ContentTime="101010"))
     volume = read_volume(tmp_path)
     assert np.array_equal(volume.voxels, plan.hu())
@@ -36,10 +39,10 @@ def test_copies_of_all_slices_are_dropped_with_a_warning(tmp_path):
 
 
 def test_series_with_copies_of_all_slices_is_listed_without_a_problem_or_phases(tmp_path):
-    write_series(tmp_path, Plan())
-    write_series(tmp_path, Plan(name="again{}".format), set_values(ContentTime="101010"))
+    write_series(tmp_path, Plan(shape=(7, 5, 6)))
+    write_series(tmp_path, Plan(shape=(7, 5, 6), name="again{}".format), set_values(ContentTime="101010"))
     series = list_series(tmp_path).series[0]
-    assert (series.slices, series.shape_ijk) == (14, [6, 5, 7])
+    assert (series.slices, series.shape_ijk) == (7 + 7, [6, 5, 7])
     assert (series.problems, series.phases) == ([], [])
 
 
@@ -78,19 +81,19 @@ def test_two_slices_at_each_place_are_listed_as_phases_with_the_element_that_dif
     tmp_path, first, second, keyword, values
 ):
     write_phase(tmp_path, 1, **first)
-    write_phase(tmp_path, 2, 500, **second)
+    write_phase(tmp_path, 2, shift=500, **second)
     series = list_series(tmp_path).series[0]
     assert series.phases == [
         {"number": n, "keyword": keyword, "value": value, "slices": 7} for n, value in enumerate(values, start=1)
     ]
     assert series.affine_ijk_to_lps_mm is None
-    assert series.slices == 14
+    assert series.slices == 7 + 7
 
 
 @TWO_PHASES
 def test_series_of_two_phases_is_refused_with_their_list(tmp_path, first, second, keyword, values):
     write_phase(tmp_path, 1, **first)
-    write_phase(tmp_path, 2, 500, **second)
+    write_phase(tmp_path, 2, shift=500, **second)
     with refused(RefusedInputError, "phases", "phase", keyword, 2, 7):
         read_volume(tmp_path)
 
@@ -98,7 +101,7 @@ def test_series_of_two_phases_is_refused_with_their_list(tmp_path, first, second
 @TWO_PHASES
 def test_each_of_two_phases_is_read_by_its_number(tmp_path, first, second, keyword, values):
     plan = write_phase(tmp_path, 1, **first)
-    write_phase(tmp_path, 2, 500, **second)
+    write_phase(tmp_path, 2, shift=500, **second)
     shifts = [500, 0] if values[-1] == "(none)" else [0, 500]  # slices without the element are the last phase
     for number, shift in enumerate(shifts, start=1):
         volume = read_volume(tmp_path, phase=number)
@@ -109,8 +112,6 @@ def test_each_of_two_phases_is_read_by_its_number(tmp_path, first, second, keywo
 @pytest.fixture
 def report_of_phase_2(tmp_path, first, second):
     """The report of the second of two phases of 7 slices each, which are told apart by an element."""
-    slices = Plan().shape[0]
-    assert slices == 7
     write_phase(tmp_path, 1, **first)
     write_phase(tmp_path, 2, shift=500, **second)  # HU, so that its slices are no copies of the first phase's
     return read_volume(tmp_path, phase=2).report
@@ -135,14 +136,14 @@ def test_warnings_of_a_phase_hold_no_date_of_its_slices(report_of_phase_2, keywo
 
 def test_phases_of_different_lengths_are_listed_and_read(tmp_path):
     write_phase(tmp_path, 1, AcquisitionNumber=1)
-    write_phase(tmp_path, 2, 9, Plan(shape=(4, 5, 6), name="b{}".format), AcquisitionNumber=2)
+    write_phase(tmp_path, 2, shift=9, plan=Plan(shape=(4, 5, 6), name="b{}".format), AcquisitionNumber=2)
     assert [phase["slices"] for phase in list_series(tmp_path).series[0].phases] == [7, 4]
     assert read_volume(tmp_path, phase=2).shape_ijk == (6, 5, 4)
 
 
 def test_four_phases_that_two_elements_tell_apart_together_are_listed_and_read(tmp_path):
     for number, (kernel, phase) in enumerate([("A", 1), ("A", 2), ("B", 1), ("B", 2)]):
-        write_phase(tmp_path, number, 100 * number, ConvolutionKernel=kernel, AcquisitionNumber=phase)
+        write_phase(tmp_path, number, shift=100 * number, ConvolutionKernel=kernel, AcquisitionNumber=phase)
     phases = list_series(tmp_path).series[0].phases
     assert [phase["value"] for phase in phases] == ["1, A", "1, B", "2, A", "2, B"]
     assert {phase["keyword"] for phase in phases} == {"AcquisitionNumber and ConvolutionKernel"}
@@ -152,7 +153,7 @@ def test_four_phases_that_two_elements_tell_apart_together_are_listed_and_read(t
 
 def test_slices_with_a_time_each_are_phases_by_the_order_of_their_times(tmp_path):
     plan = write_phase(tmp_path, 1, AcquisitionTime=lambda k: f"1010{10 + k}")
-    write_phase(tmp_path, 2, 300, AcquisitionTime=lambda k: f"1010{30 - k}")
+    write_phase(tmp_path, 2, shift=300, AcquisitionTime=lambda k: f"1010{30 - k}")
     phases = list_series(tmp_path).series[0].phases
     assert [(phase["keyword"], phase["value"]) for phase in phases] == [
         ("order of AcquisitionTime", "1"),
@@ -170,7 +171,7 @@ def test_two_different_slices_at_one_place_that_no_element_tells_apart_are_refus
 
 def test_copy_of_a_slice_of_a_phase_is_dropped_with_a_warning(tmp_path):
     write_phase(tmp_path, 1, AcquisitionNumber=1)
-    write_phase(tmp_path, 2, 500, AcquisitionNumber=2)
+    write_phase(tmp_path, 2, shift=500, AcquisitionNumber=2)
     (tmp_path / "copy").write_bytes((tmp_path / "phase2-3").read_bytes())
     volume = read_volume(tmp_path, phase=2)
     assert volume.shape_ijk == (6, 5, 7)
@@ -182,7 +183,7 @@ def test_copy_of_a_slice_of_a_phase_is_dropped_with_a_warning(tmp_path):
 )
 def test_phase_that_is_not_there_or_no_number_is_refused(tmp_path, phase, fact):
     write_phase(tmp_path, 1, AcquisitionNumber=1)
-    write_phase(tmp_path, 2, 500, AcquisitionNumber=2)
+    write_phase(tmp_path, 2, shift=500, AcquisitionNumber=2)
     with refused(UsageError, "phase", fact):
         read_volume(tmp_path, phase=phase)
 
@@ -218,7 +219,7 @@ def test_slices_of_the_same_stored_values_with_another_rescale_are_no_copies(tmp
 @pytest.fixture
 def series_of_two_patients(tmp_path):
     """7 slices of the patient with the ID ONE, and 4 of TWO."""
-    write_series(tmp_path / "a", Plan(series=1), set_values(PatientID="ONE"))
+    write_series(tmp_path / "a", Plan(series=1, shape=(7, 5, 6)), set_values(PatientID="ONE"))
     write_series(tmp_path / "b", Plan(series=2, shape=(4, 5, 6)), set_values(PatientID="TWO"))
     return tmp_path
 
@@ -233,7 +234,7 @@ def test_series_of_two_patients_are_refused_with_their_list_and_without_their_id
 
 
 def test_series_of_one_of_two_patients_is_read_by_its_number(series_of_two_patients):
-    assert read_volume(series_of_two_patients, 2).shape_ijk == (6, 5, 4)
+    assert read_volume(series_of_two_patients, series=2).shape_ijk == (6, 5, 4)
 
 
 def test_series_of_two_patients_are_listed_with_none_chosen(series_of_two_patients):
@@ -250,9 +251,9 @@ def test_series_of_two_studies_are_listed_with_the_number_of_each(tmp_path):
 
 def test_slice_of_another_study_within_a_series_is_refused(tmp_path):
     write_series(tmp_path, Plan(series=1), set_values(StudyInstanceUID="1.2.1"))
-    write_series(tmp_path, Plan(series=1), set_values(3, StudyInstanceUID="1.2.9"))
+    write_series(tmp_path, Plan(series=1), set_values(only=3, StudyInstanceUID="1.2.9"))
     with refused(RefusedInputError, "StudyInstanceUID", "series"):
-        read_volume(tmp_path, 1)
+        read_volume(tmp_path, series=1)
 
 
 def test_three_localizers_at_one_place_are_listed_without_phases(tmp_path):
@@ -280,7 +281,7 @@ def test_series_whose_directions_are_not_at_right_angles_is_listed_with_that_pro
 
 def test_slices_that_are_the_same_in_two_phases_belong_to_both(tmp_path):
     plan = write_phase(tmp_path, 1, AcquisitionNumber=1)
-    write_phase(tmp_path, 2, 500, AcquisitionNumber=2)
+    write_phase(tmp_path, 2, shift=500, AcquisitionNumber=2)
     for k in (0, 6):  # first and last slice of phase 2: the pixels of phase 1
         ds = make_dataset(plan, k)
         ds.AcquisitionNumber = 2
@@ -294,7 +295,7 @@ def test_slices_that_are_the_same_in_two_phases_belong_to_both(tmp_path):
 
 def test_copy_beside_slices_that_are_the_same_in_two_phases_is_dropped_with_a_warning(tmp_path):
     plan = write_phase(tmp_path, 1, AcquisitionNumber=1)
-    write_phase(tmp_path, 2, 500, AcquisitionNumber=2)
+    write_phase(tmp_path, 2, shift=500, AcquisitionNumber=2)
     ds = make_dataset(plan, 0)
     ds.AcquisitionNumber = 2
     save_dataset(ds, tmp_path / "phase2-0")
@@ -306,7 +307,7 @@ def test_copy_beside_slices_that_are_the_same_in_two_phases_is_dropped_with_a_wa
 
 def test_phases_by_the_order_of_times_may_have_a_slice_in_common(tmp_path):
     plan = write_phase(tmp_path, 1, AcquisitionTime=lambda k: f"1010{10 + k}")
-    write_phase(tmp_path, 2, 300, AcquisitionTime=lambda k: f"1010{30 + k}")
+    write_phase(tmp_path, 2, shift=300, AcquisitionTime=lambda k: f"1010{30 + k}")
     ds = make_dataset(plan, 0)  # the first slice of the second phase: the pixels of the first
     ds.AcquisitionTime = "101030"
     save_dataset(ds, tmp_path / "phase2-0")
@@ -349,14 +350,14 @@ def test_slices_of_equal_pixels_and_another_geometry_are_not_dropped_but_refused
 )
 def test_slices_whose_times_tell_no_passes_apart_are_refused(tmp_path, first, second):
     write_phase(tmp_path, 1, **first)
-    write_phase(tmp_path, 2, 500, **second)
+    write_phase(tmp_path, 2, shift=500, **second)
     with refused(RefusedInputError, "element", "headers", 2):
         read_volume(tmp_path)
 
 
 def test_slices_of_a_table_that_stops_for_both_phases_are_read_by_the_order_of_their_times(tmp_path):
     plan = write_phase(tmp_path, 1, AcquisitionTime=lambda k: f"10{10 + k // 3}10")  # three slices at each stop
-    write_phase(tmp_path, 2, 500, AcquisitionTime=lambda k: f"10{10 + k // 3}20")
+    write_phase(tmp_path, 2, shift=500, AcquisitionTime=lambda k: f"10{10 + k // 3}20")
     assert np.array_equal(read_volume(tmp_path, phase=2).voxels, plan.hu() + 500)
 
 
@@ -371,7 +372,7 @@ def write_two_volumes(folder, keyword, values, along):
     """Two volumes, the second with pixels 500 higher and `along` mm towards the head."""
     plans = [Plan(name=f"{n}-{{}}".format, origin=(-12.5, 31.25, -400 + n * along)) for n in (0, 1)]
     for number, value in enumerate(values):
-        write_phase(folder, number, 500 * number, plans[number], **{keyword: value})
+        write_phase(folder, number, shift=500 * number, plan=plans[number], **{keyword: value})
     return plans
 
 
@@ -422,7 +423,7 @@ def test_acquisition_number_that_counts_along_a_stack_is_not_warned_of(tmp_path,
 
 def test_phase_that_is_shorter_than_another_is_warned_of(tmp_path):
     write_phase(tmp_path, 1, AcquisitionNumber=1)
-    write_phase(tmp_path, 2, 500, Plan(name="b{}".format, leave_out=(6,)), AcquisitionNumber=2)
+    write_phase(tmp_path, 2, shift=500, plan=Plan(name="b{}".format, leave_out=(6,)), AcquisitionNumber=2)
     assert "phase 2 has 6 slices, another one 7" in read_volume(tmp_path, phase=2).report["warnings"]
     assert not any("another one" in warning for warning in read_volume(tmp_path, phase=1).report["warnings"])
 

@@ -68,6 +68,7 @@ def series_named(request, tmp_path):
 
 
 def damage_last(plan, folder, damage):
+    """Damage the file of the last slice in one of the ways of `DAMAGE`; its path."""
     change, _ = DAMAGE[damage]
     file = folder / plan.name(COUNT - 1)
     file.write_bytes(change(file.read_bytes()))
@@ -76,8 +77,8 @@ def damage_last(plan, folder, damage):
 
 @pytest.mark.parametrize("damage", DAMAGE)
 def test_series_with_remains_of_its_last_slice_is_refused_until_they_are_removed(series_named, damage):
-    file = damage_last(*series_named, damage)
-    folder = series_named[1]
+    plan, folder = series_named
+    file = damage_last(plan, folder, damage)
     with refused(RefusedInputError, file.name):
         read_volume(folder)
     file.unlink()
@@ -86,8 +87,9 @@ def test_series_with_remains_of_its_last_slice_is_refused_until_they_are_removed
 
 @pytest.mark.parametrize("damage", DAMAGE)
 def test_remains_of_a_slice_fail_the_gate_of_files_with_a_warning_that_does_not_name_them(series_named, damage):
-    file = damage_last(*series_named, damage)
-    listing = list_series(series_named[1])
+    plan, folder = series_named
+    file = damage_last(plan, folder, damage)
+    listing = list_series(folder)
     gates = {gate["name"]: gate for gate in listing.certificate["gates"]}
     assert (gates["readable"]["ok"], gates["readable"]["measured"]) == (False, 1)
     assert any(warning.startswith("1 skipped: ") for warning in listing.warnings)

@@ -109,7 +109,7 @@ def test_command_info_refuses_a_rescale_that_is_no_slope_and_intercept(tmp_path,
     ],
 )
 def scan_not_in_hu(request, tmp_path_factory):
-    """A series whose values are not known to be HU, and a level of its bone."""
+    """A series whose values are not known to be HU, and a level of its bone, each some 690 HU by the true rescale."""
     values, level = request.param
     return str(write_values(tmp_path_factory.mktemp("ct"), make_body(), Plan(shape=SHAPE), **values)), level
 

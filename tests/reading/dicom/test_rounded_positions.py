@@ -14,8 +14,8 @@ from clrecon.reading import list_series, read_volume
 SLICES = 60
 
 
-def write_rounded(folder, step, digits, stated=None, keyword="SliceThickness", **plan):
-    """Even steps along z, written with `digits` decimals; `stated` is the distance that the headers state."""
+def write_rounded(folder, *, step, digits, stated=None, keyword="SliceThickness", **plan):
+    """Even steps along z in mm, written with `digits` decimals; the headers state the distance `stated`, or `step`."""
 
     def change(ds, k):
         ds.InstanceNumber = k + 1
@@ -43,7 +43,7 @@ ROUNDED_STEPS = pytest.mark.parametrize(
 
 @ROUNDED_STEPS
 def test_even_steps_rounded_to_few_digits_are_read_as_one_even_stack(tmp_path, step, digits, keyword):
-    write_rounded(tmp_path, step, digits, keyword=keyword)
+    write_rounded(tmp_path, step=step, digits=digits, keyword=keyword)
     report = read_volume(tmp_path).report
     last_digit_mm = 10.0**-digits
     assert (report["uneven"], report["slices_missing"]) == (False, 0)
@@ -55,7 +55,7 @@ def test_even_steps_rounded_to_few_digits_are_read_as_one_even_stack(tmp_path, s
 
 @ROUNDED_STEPS
 def test_even_steps_rounded_to_few_digits_are_warned_of_with_the_stated_distance(tmp_path, step, digits, keyword):
-    write_rounded(tmp_path, step, digits, keyword=keyword)
+    write_rounded(tmp_path, step=step, digits=digits, keyword=keyword)
     (warning,) = read_volume(tmp_path).report["warnings"]
     decimals = f"{digits} decimal{'s' * (digits != 1)}"
     assert warning.startswith(
@@ -66,7 +66,7 @@ def test_even_steps_rounded_to_few_digits_are_warned_of_with_the_stated_distance
 
 @pytest.mark.parametrize("lost", daily(3, [1, 2, 20, 30, 57, 58]))
 def test_missing_slice_among_rounded_positions_is_refused(tmp_path, lost):
-    write_rounded(tmp_path, 0.0105, 2, leave_out=(lost,))
+    write_rounded(tmp_path, step=0.0105, digits=2, leave_out=(lost,))
     with refused(RefusedInputError, "slice", "missing"):
         read_volume(tmp_path)
 
@@ -74,26 +74,26 @@ def test_missing_slice_among_rounded_positions_is_refused(tmp_path, lost):
 @pytest.mark.parametrize("lost", daily(1, [1, 30, 58]))
 def test_missing_slice_among_positions_in_whole_millimetres_is_refused(tmp_path, lost):
     """Steps that are a multiple of the unit are not changed by rounding."""
-    write_rounded(tmp_path, 1.0, 0, leave_out=(lost,))
+    write_rounded(tmp_path, step=1.0, digits=0, leave_out=(lost,))
     with refused(RefusedInputError, "slice", "missing", 1):
         read_volume(tmp_path)
 
 
 @pytest.mark.parametrize("stated", daily(1, [5, 0.02]), ids=str)
 def test_rounded_positions_whose_headers_state_another_distance_are_refused(tmp_path, stated):
-    write_rounded(tmp_path, 0.0105, digits=2, stated=stated)
+    write_rounded(tmp_path, step=0.0105, digits=2, stated=stated)
     with refused(RefusedInputError, "slice", "missing"):
         read_volume(tmp_path)
 
 
 def test_missing_slice_among_positions_with_enough_digits_is_refused(tmp_path):
-    write_rounded(tmp_path, 0.0105, digits=3, leave_out=(30,))
+    write_rounded(tmp_path, step=0.0105, digits=3, leave_out=(30,))
     with refused(RefusedInputError, "slice", "missing"):
         read_volume(tmp_path)
 
 
 def test_slice_further_off_its_even_place_than_rounding_makes_the_stack_uneven(tmp_path):
-    write_rounded(tmp_path, 1.5, digits=1, offsets={20: 0.3})
+    write_rounded(tmp_path, step=1.5, digits=1, offsets={20: 0.3})
     report = list_series(tmp_path).certificate
     assert report["uneven"]
     assert not any("decimal" in warning for warning in report["warnings"])
@@ -114,7 +114,7 @@ def test_decimals_of_positions_are_the_most_that_any_of_them_has(tmp_path):
 
 
 def test_slices_that_rounding_puts_at_one_place_are_refused_with_the_digits(tmp_path):
-    write_rounded(tmp_path, 0.6, digits=0)
+    write_rounded(tmp_path, step=0.6, digits=0)
     with refused(RefusedInputError, "decimals", "digits", 0, 0.6):
         read_volume(tmp_path)
 

@@ -37,86 +37,89 @@ CONTRACT = (
 
 
 @pytest.fixture
-def two_series(tmp_path):
+def series_of_7_and_4(tmp_path):
+    """The UIDs end with 2 and 5; the listing numbers them 1, of 7 slices, and 2, of 4."""
     return write_two_series(tmp_path)
 
 
-def test_listing_has_the_names_of_the_contract(two_series):
-    entries = [entry.as_dict() for entry in list_series(two_series).series]
+def test_listing_has_the_names_of_the_contract(series_of_7_and_4):
+    entries = [entry.as_dict() for entry in list_series(series_of_7_and_4).series]
     assert [list(entry)[: len(CONTRACT)] for entry in entries] == [CONTRACT, CONTRACT]
     assert json.loads(json.dumps(entries)) == entries
 
 
-def test_listing_begins_with_the_largest_series_and_chooses_it(two_series):
-    listing = list_series(two_series)
+def test_listing_begins_with_the_largest_series_and_chooses_it(series_of_7_and_4):
+    listing = list_series(series_of_7_and_4)
     assert listing.chosen == 1
     assert [(entry.number, entry.slices) for entry in listing.series] == [(1, 7), (2, 4)]
 
 
-def test_listing_describes_a_series_by_its_stack(two_series):
-    entry = list_series(two_series).series[0].as_dict()
+def test_listing_describes_a_series_by_its_stack(series_of_7_and_4):
+    entry = list_series(series_of_7_and_4).series[0].as_dict()
+    (dj, di), gap = Plan().pixel_spacing, Plan().gap
     expected = {
         "uid_hash": hash_of(2), "description": "series 2", "modality": "CT",
-        "shape_ijk": [6, 5, 7], "spacing_mm": pytest.approx([0.5, 0.7, 1.25]),
-        "gap_mm": pytest.approx({"min": 1.25, "max": 1.25, "median": 1.25}),
+        "shape_ijk": [6, 5, 7], "spacing_mm": pytest.approx([di, dj, gap]),
+        "gap_mm": pytest.approx({"min": gap, "max": gap, "median": gap}),
         "tilt_deg": pytest.approx(0, abs=tolerances.TILT_DEG), "uneven": False, "warnings": [], "problems": [],
     }  # fmt: skip
     assert {name: entry[name] for name in expected} == expected
-    assert np.array(entry["affine_ijk_to_lps_mm"])[:3, 3] == pytest.approx([-12.5, 31.25, -400.0])  # of the plan
+    assert np.array(entry["affine_ijk_to_lps_mm"])[:3, 3] == pytest.approx(Plan().origin)
     assert entry["grid_residual_max_mm"] < tolerances.GRID_RESIDUAL_MM
 
 
-def test_series_with_the_most_slices_is_read_and_the_other_warned_of(two_series):
-    report = read_volume(two_series).report
+def test_series_with_the_most_slices_is_read_and_the_other_warned_of(series_of_7_and_4):
+    report = read_volume(series_of_7_and_4).report
     assert report["series"] == {"number": 1, "uid_hash": hash_of(2), "modality": "CT"}
     assert report["warnings"] == [
         "1 other CT series not used: [2: CT, 4 slices]; series 1 is read, with the most slices"
     ]
-    assert report["files"] == {"found": 11, "used": 7, "skipped": {}}
-    assert list_series(two_series).warnings == report["warnings"]
+    assert report["files"] == {"found": 7 + 4, "used": 7, "skipped": {}}
+    assert list_series(series_of_7_and_4).warnings == report["warnings"]
 
 
 @pytest.mark.parametrize("wanted", [2, "2", "series 5", "SERIES 5", "es 5", f"{ROOT}.5", hash_of(5)])
-def test_series_is_chosen_by_number_description_uid_or_hash(two_series, wanted):
-    assert read_volume(two_series, wanted).report["series"]["number"] == 2
+def test_series_is_chosen_by_number_description_uid_or_hash(series_of_7_and_4, wanted):
+    assert read_volume(series_of_7_and_4, wanted).report["series"]["number"] == 2
 
 
 @pytest.mark.parametrize("wanted", [3, "neck", "", "9", "1.2.4"])
-def test_series_that_is_not_there_is_refused_with_those_that_are(two_series, wanted):
-    with refused(UsageError, repr(wanted), "CT", 1, 7, 2, 4):
-        read_volume(two_series, wanted)
+def test_series_that_is_not_there_is_refused_with_those_that_are(series_of_7_and_4, wanted):
+    numbers_and_slices = (1, 7, 2, 4)
+    with refused(UsageError, repr(wanted), "CT", *numbers_and_slices):
+        read_volume(series_of_7_and_4, wanted)
 
 
-def test_text_that_several_descriptions_hold_is_refused_with_their_list(two_series):
+def test_text_that_several_descriptions_hold_is_refused_with_their_list(series_of_7_and_4):
     write_series(
-        two_series, Plan(series=8, shape=(3, 5, 6), name="neck{}".format), set_values(SeriesDescription="neck")
+        series_of_7_and_4, Plan(series=8, shape=(3, 5, 6), name="neck{}".format), set_values(SeriesDescription="neck")
     )
     with pytest.raises(UsageError) as caught:
-        read_volume(two_series, "erie")
+        read_volume(series_of_7_and_4, "erie")
     assert str(caught.value) == (
         "2 series match series 'erie': [1: CT, 7 slices], [2: CT, 4 slices] (\"clrecon info\" describes them)"
     )
 
 
 @pytest.mark.parametrize("wanted", [hash_of(5)[:4], hash_of(5)[:10].upper()], ids=["4 letters", "10 letters"])
-def test_series_is_chosen_by_the_start_of_its_hash(two_series, wanted):
-    assert read_volume(two_series, wanted).report["series"]["number"] == 2
+def test_series_is_chosen_by_the_start_of_its_hash(series_of_7_and_4, wanted):
+    assert read_volume(series_of_7_and_4, wanted).report["series"]["number"] == 2
 
 
-def test_three_letters_of_a_hash_choose_no_series(two_series):
+def test_three_letters_of_a_hash_choose_no_series(series_of_7_and_4):
     with refused(UsageError, "series", 2, 4):
-        read_volume(two_series, hash_of(5)[:3])
+        read_volume(series_of_7_and_4, hash_of(5)[:3])
 
 
-def test_start_of_two_uids_is_refused(two_series):
+def test_start_of_two_uids_is_refused(series_of_7_and_4):
     with refused(UsageError, 2, "series"):
-        read_volume(two_series, ROOT)
+        read_volume(series_of_7_and_4, ROOT)
 
 
 def test_two_series_of_equal_size_are_refused_with_their_list(tmp_path):
-    write_series(tmp_path, Plan(series=1))
-    write_series(tmp_path, Plan(series=2, name="x{}".format))
-    with refused(RefusedInputError, "CT", 2, 7, 1):
+    write_series(tmp_path, Plan(series=1, shape=(7, 5, 6)))
+    write_series(tmp_path, Plan(series=2, shape=(7, 5, 6), name="x{}".format))
+    with refused(RefusedInputError, "CT", 1, 2, 7):  # both numbers, and the slices of each
         read_volume(tmp_path)
     assert read_volume(tmp_path, series=2).report["series"]["uid_hash"] == hash_of(2)
 
@@ -129,21 +132,21 @@ def test_of_two_series_of_equal_size_none_is_chosen_in_the_listing(tmp_path):
     assert "choose one with series" in listing.warnings[0]
 
 
-def test_faulty_largest_series_is_refused_and_not_passed_over(two_series):
-    spoil_largest(two_series)
+def test_faulty_largest_series_is_refused_and_not_passed_over(series_of_7_and_4):
+    spoil_largest(series_of_7_and_4)
     with refused(RefusedInputError, "b3", "PixelSpacing", 1):
-        read_volume(two_series)
+        read_volume(series_of_7_and_4)
 
 
-def test_smaller_series_beside_a_faulty_one_is_read_by_its_number_without_a_warning(two_series):
-    spoil_largest(two_series)
-    smaller = read_volume(two_series, 2)
+def test_smaller_series_beside_a_faulty_one_is_read_by_its_number_without_a_warning(series_of_7_and_4):
+    spoil_largest(series_of_7_and_4)
+    smaller = read_volume(series_of_7_and_4, series=2)
     assert smaller.voxels.shape == (4, 5, 6)
     assert smaller.report["warnings"] == []
 
 
 def spoil_largest(folder):
-    """Give one slice of the largest of `two_series` pixels of 0 mm."""
+    """Give one slice of the largest of `series_of_7_and_4` pixels of 0 mm."""
     file = folder / "sub" / "b3"
     ds = pydicom.dcmread(file)
     set_raw("PixelSpacing", "0\\0")(ds, 3)
@@ -151,8 +154,8 @@ def spoil_largest(folder):
 
 
 def test_usable_one_of_two_series_of_equal_size_is_read_and_the_other_warned_of(tmp_path):
-    write_series(tmp_path, Plan(series=1), set_raw("PixelSpacing", "0\\0", only=3))
-    write_series(tmp_path, Plan(series=2, name="x{}".format))
+    write_series(tmp_path, Plan(series=1, shape=(7, 5, 6)), set_raw("PixelSpacing", "0\\0", only=3))
+    write_series(tmp_path, Plan(series=2, shape=(7, 5, 6), name="x{}".format))
     report = read_volume(tmp_path).report
     assert report["series"]["uid_hash"] == hash_of(2)
     assert report["warnings"] == [
@@ -162,10 +165,10 @@ def test_usable_one_of_two_series_of_equal_size_is_read_and_the_other_warned_of(
 
 
 def test_two_usable_series_beside_a_faulty_one_of_equal_size_are_refused_without_that(tmp_path):
-    write_series(tmp_path, Plan(series=1), set_raw("PixelSpacing", "0\\0", only=3))
+    write_series(tmp_path, Plan(series=1, shape=(7, 5, 6)), set_raw("PixelSpacing", "0\\0", only=3))
     for number in (2, 3):
-        write_series(tmp_path, Plan(series=number, name=f"{number}-{{}}".format))
-    with refused(RefusedInputError, "CT", 2, 7, 3) as refusal:
+        write_series(tmp_path, Plan(series=number, shape=(7, 5, 6), name=f"{number}-{{}}".format))
+    with refused(RefusedInputError, "CT", 2, 3, 7) as refusal:  # both numbers, and the slices of each
         read_volume(tmp_path)
     assert "[1: " not in repr(refusal.value)
 
@@ -173,7 +176,7 @@ def test_two_usable_series_beside_a_faulty_one_of_equal_size_are_refused_without
 def test_two_faulty_series_of_equal_size_are_refused_though_a_smaller_one_is_usable(tmp_path):
     for number in (1, 2):
         spoil = set_raw("PixelSpacing", "0\\0", only=3)
-        write_series(tmp_path, Plan(series=number, name=f"{number}-{{}}".format), spoil)
+        write_series(tmp_path, Plan(series=number, shape=(7, 5, 6), name=f"{number}-{{}}".format), spoil)
     write_series(tmp_path, Plan(series=3, shape=(4, 5, 6), name="3-{}".format))
     with refused(RefusedInputError, "PixelSpacing", 7, 1, 3):
         read_volume(tmp_path)
@@ -182,7 +185,7 @@ def test_two_faulty_series_of_equal_size_are_refused_though_a_smaller_one_is_usa
 @pytest.mark.parametrize("frames", [7, 300], ids=["as many", "more"])
 def test_multi_frame_image_without_places_of_its_frames_counts_as_one_slice(tmp_path, frames):
     """It is one image of unknown content, whatever number of frames it claims."""
-    plan = write_series(tmp_path, Plan(series=1))
+    plan = write_series(tmp_path, Plan(series=1, shape=(7, 5, 6)))
     ds = make_dataset(Plan(series=2), 0)
     ds.NumberOfFrames = frames
     save_dataset(ds, tmp_path / "many")
@@ -192,7 +195,7 @@ def test_multi_frame_image_without_places_of_its_frames_counts_as_one_slice(tmp_
         "1 other CT series not used: [2: CT, 1 slice]; series 1 is read, with the most slices"
     ]
     with refused(RefusedInputError, frames, "SOP"):
-        read_volume(tmp_path, 2)
+        read_volume(tmp_path, series=2)
 
 
 def test_a_localizer_in_the_series_is_parted(tmp_path):
@@ -220,9 +223,9 @@ def test_slice_in_another_plane_in_the_series_is_listed_and_left_as_another_seri
 
 
 def test_series_with_a_slice_in_another_plane_is_chosen_by_its_uid(tmp_path):
-    write_series(tmp_path)
-    save_dataset(make_dataset(Plan(angles=(90, 0, 0), shape=(1, 9, 9)), 0), tmp_path / "scout")
-    assert read_volume(tmp_path, f"{ROOT}.1").report["slices"] == 7
+    plan = write_series(tmp_path, Plan(series=1))
+    save_dataset(make_dataset(Plan(series=1, angles=(90, 0, 0), shape=(1, 9, 9)), 0), tmp_path / "scout")
+    assert read_volume(tmp_path, f"{ROOT}.1").report["slices"] == plan.shape[0]
 
 
 def test_secondary_capture_in_the_series_is_listed_apart_with_its_problem(tmp_path):
@@ -240,7 +243,8 @@ def test_secondary_capture_in_the_series_is_listed_apart_with_its_problem(tmp_pa
 
 
 def write_mr(folder):
-    write_series(folder, change=set_values(Modality="MR", SOPClassUID=MRImageStorage))
+    """A series of MR of 7 slices."""
+    write_series(folder, Plan(shape=(7, 5, 6)), change=set_values(Modality="MR", SOPClassUID=MRImageStorage))
 
 
 def test_folder_of_mr_alone_is_refused(tmp_path):
@@ -263,7 +267,7 @@ def test_ct_beside_a_larger_series_of_mr_is_read_and_the_mr_refused(tmp_path):
     write_series(tmp_path, Plan(series=2, shape=(3, 5, 6), name="ct{}".format))
     assert read_volume(tmp_path).report["series"]["modality"] == "CT"
     with refused(NoDicomError, "MR", "CT", 1):
-        read_volume(tmp_path, 1)
+        read_volume(tmp_path, series=1)
 
 
 def test_two_series_of_one_slice_are_refused(tmp_path):
@@ -302,7 +306,10 @@ def test_descriptions_keep_their_character_set(tmp_path):
 
 @pytest.fixture
 def doe_folder(tmp_path):
-    """Two series, a corrupt file and a text, with "Doe" in names and descriptions, three slices not in HU."""
+    """Two series, of 7 slices and of 3, a corrupt file and a text, with "Doe" in names and descriptions.
+
+    Of the first series the slices 2, 3 and 6 are not in HU.
+    """
     folder = tmp_path / "Doe^John"
 
     def spoil(ds, k):
@@ -310,7 +317,7 @@ def doe_folder(tmp_path):
         if k in (2, 3, 6):
             ds.RescaleType = "US"
 
-    write_series(folder, Plan(tilt_deg=3, name="Doe{}.dcm".format), spoil)
+    write_series(folder, Plan(shape=(7, 5, 6), tilt_deg=3, name="Doe{}.dcm".format), spoil)
     write_series(folder / "Doe2", Plan(series=2, shape=(3, 5, 6), name="Doe{}.dcm".format), spoil)
     (folder / "Doe2" / "Doe9").write_bytes(bytes(128) + b"DICM" + b"\xff" * 50)
     (folder / "Doe2" / "Doe8.dcm").write_text("none")
@@ -325,9 +332,10 @@ def test_report_and_warnings_hold_no_patient_data_and_no_folder(doe_folder):
 
 
 def test_warnings_count_slices_files_and_series_without_naming_them(doe_folder):
+    _, _, z_mm = Plan().position(2)  # of the first slice that is not in HU
     assert read_volume(doe_folder).report["warnings"] == [
         "gantry tilt -3.00 degrees: kept exactly, as a shear",
-        "RescaleType is 'US': the values are not HU (3 of 7 slices, the first at -397.50 mm)",
+        f"RescaleType is 'US': the values are not HU (3 of 7 slices, the first at {z_mm:.2f} mm)",
         "1 corrupt file skipped",
         "1 skipped: named like DICOM but is none",
         "1 other CT series not used: [2: CT, 3 slices]; series 1 is read, with the most slices",
@@ -421,9 +429,9 @@ def test_pipe_is_refused_as_input(with_links_and_pipes):
 
 
 def test_folder_that_is_named_by_a_link_is_read(tmp_path):
-    write_series(tmp_path / "ct")
+    plan = write_series(tmp_path / "ct")
     os.symlink(tmp_path / "ct", tmp_path / "named")
-    assert read_volume(tmp_path / "named").report["slices"] == 7
+    assert read_volume(tmp_path / "named").report["slices"] == plan.shape[0]
 
 
 @pytest.fixture
@@ -459,18 +467,20 @@ def test_single_slice_of_another_scanner_is_listed_without_gaps_and_affine():
     assert series.gap_mm == {"min": None, "max": None, "median": None}
 
 
-def test_progress_of_reading_counts_files_and_then_slices(two_series):
+def test_progress_of_reading_counts_files_and_then_slices(series_of_7_and_4):
     calls = []
-    read_volume(two_series, progress=lambda *call: calls.append(call))
-    assert calls == [("scan", n, 11) for n in range(1, 12)] + [("read", n, 7) for n in range(1, 8)]
+    read_volume(series_of_7_and_4, progress=lambda *call: calls.append(call))
+    assert calls == [("scan", n, 7 + 4) for n in range(1, 7 + 4 + 1)] + [("read", n, 7) for n in range(1, 7 + 1)]
 
 
 def test_last_slice_tilted_by_2_degrees_is_left_with_a_warning(tmp_path):
     """At the end of the stack it leaves no hole."""
     across, along = np.cos(np.radians(2.0)), np.sin(np.radians(2.0))
-    write_series(tmp_path, Plan(), set_values(6, ImageOrientationPatient=[1, 0, 0, 0, across, along]))
+    write_series(
+        tmp_path, Plan(shape=(7, 5, 6)), set_values(only=6, ImageOrientationPatient=[1, 0, 0, 0, across, along])
+    )
     volume = read_volume(tmp_path)
-    assert volume.shape_ijk == (6, 5, 6)
+    assert volume.shape_ijk == (6, 5, 7 - 1)
     warning = "1 slice of the series that is read left: in another plane, 2.0 degrees off"
     assert warning in volume.report["warnings"]
     assert warning in list_series(tmp_path).warnings
@@ -478,8 +488,9 @@ def test_last_slice_tilted_by_2_degrees_is_left_with_a_warning(tmp_path):
 
 def test_two_series_without_uids_are_told_apart_by_their_numbers(tmp_path):
     without_uids = {"SeriesInstanceUID": "", "FrameOfReferenceUID": "1.2.3"}
-    write_series(tmp_path, Plan(series=1), set_values(**without_uids))
-    below = Plan(series=2, shape=(4, 5, 6), name="b{}".format, origin=(-12.5, 31.25, -400 - 4 * 1.25))
+    above = write_series(tmp_path, Plan(series=1, shape=(7, 5, 6)), set_values(**without_uids))
+    x, y, z = above.origin
+    below = Plan(series=2, shape=(4, 5, 6), name="b{}".format, origin=(x, y, z - 4 * above.gap))
     write_series(tmp_path, below, set_values(**without_uids))
     assert [series.slices for series in list_series(tmp_path).series] == [7, 4]
     volume = read_volume(tmp_path)

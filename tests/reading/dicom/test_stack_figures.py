@@ -136,7 +136,7 @@ def test_gate_of_gaps_measures_the_largest_multiple_of_the_thickness_of_the_slic
 def test_stated_gap_is_compared_with_the_nearer_of_those_along_normal_and_table(stated, expected):
     """Stated and measured gap in mm, and by which share they differ."""
     positions = np.outer(np.arange(4.0), [0.0, 3.0, 4.0])  # 5 mm along the table, 4 mm along the normal
-    assert measure_stated_gap(headers_with(stated_gap_mm=stated), positions, 4.0) == expected
+    assert measure_stated_gap(headers_with(stated_gap_mm=stated), positions, usual=4.0) == expected
 
 
 def equal_headers(*thickness: float) -> list[Any]:
@@ -198,8 +198,8 @@ def test_elements_of_series_pixels_and_overlays_are_not_compared_along_a_stack(t
 
 
 def test_alternation_is_named_by_keyword_or_by_tag_where_there_is_none():
-    assert Alternation(0x00180060, (), False).name == "KVP"
-    assert Alternation(0x00091001, (), False).name == "(0009,1001)"
+    assert Alternation(tag=0x00180060, groups=(), certain=False).name == "KVP"
+    assert Alternation(tag=0x00091001, groups=(), certain=False).name == "(0009,1001)"
 
 
 def test_values_of_more_than_64_bytes_are_compared_by_a_hash():
@@ -208,6 +208,7 @@ def test_values_of_more_than_64_bytes_are_compared_by_a_hash():
 
 
 def part(number: int, first: int | None, frames: int = 10, parts: int | None = 3) -> Any:
+    """A file of a concatenation: part `number`, of 10 frames, the first of which is `first`, from 0."""
     return SimpleNamespace(concatenation=Concatenation("1.2", number, parts, first, frames))
 
 
@@ -394,7 +395,11 @@ def test_decoders_find_modules_of_all_folders_of_the_path_but_the_current_one(tm
 
 @pytest.mark.parametrize(
     ("overlays", "expected"),
-    [([12], (0, 0, True, None)), ([12, 13, 14, 15], (0, 0, False, None)), ([], (1, 0, True, (4101, 5)))],
+    [
+        ([12], stray_bits.StrayBits(odd=0, signs=True)),
+        ([12, 13, 14, 15], stray_bits.StrayBits(odd=0, signs=False)),
+        ([], stray_bits.StrayBits(odd=1, signs=True, example=(4101, 5))),
+    ],
     ids=["overlay in the bit that is set", "overlays in all upper bits", "no overlay"],
 )
 def test_bit_above_the_stored_ones_is_stray_unless_an_overlay_is_in_it(overlays, expected, monkeypatch):
@@ -452,18 +457,14 @@ SIGNS = [(False, None), (False, False), (True, True), (True, None), (True, False
 """Whether the header says that pixels are signed, and what the codestream says; None where it says nothing."""
 
 
-def settle_sign(declared, coded, values, bits=10):
-    header: Any = SimpleNamespace(bits_stored=12, signed=declared)
-    frame: Any = SimpleNamespace(bits=bits, signed=coded)
-    stored._settle_sign(header, frame, np.array([values], np.int16))
-
-
 @pytest.mark.parametrize(
     ("declared", "coded", "doubtful"), [(True, None, "no sign"), (True, False, "no sign"), (False, True, "a sign")]
 )
 def test_pixels_with_the_tenth_bit_are_refused_where_header_and_codestream_differ_in_sign(declared, coded, doubtful):
+    header: Any = SimpleNamespace(bits_stored=12, signed=declared)
+    frame: Any = SimpleNamespace(bits=10, signed=coded)
     with pytest.raises(RefusedInputError, match=f"has 10 bits and {doubtful}, the header says 12 bits with"):
-        settle_sign(declared, coded, [0, 512])
+        stored._settle_sign(header, frame, np.array([[0, 512]], np.int16))
 
 
 @pytest.mark.parametrize(("declared", "coded"), SIGNS)

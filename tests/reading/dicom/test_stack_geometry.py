@@ -101,6 +101,7 @@ def test_skewed_directions_are_made_orthonormal_with_a_warning(tmp_path):
     assert "0.0005: made orthonormal" in volume.report["warnings"][0]
 
 
+# Slice k of a plan lies at -400 + 1.25 k mm.
 STACKS_WITH_HOLES = pytest.mark.parametrize(
     ("plan", "words"),
     [
@@ -132,14 +133,17 @@ def test_stack_with_holes_or_of_one_slice_is_listed_without_an_affine_and_with_i
 @pytest.mark.parametrize(
     ("change", "facts"),
     [
-        (set_values(2, FrameOfReferenceUID="1.2.3.4"), ("FrameOfReferenceUID", "slice002.dcm")),
-        (set_values(2, PixelSpacing=[0.7, 0.51]), ("PixelSpacing", "0.7\\0.51", "slice002.dcm")),
+        (set_values(only=2, FrameOfReferenceUID="1.2.3.4"), ("FrameOfReferenceUID", "slice002.dcm")),
+        (set_values(only=2, PixelSpacing=[0.7, 0.51]), ("PixelSpacing", "0.7\\0.51", "slice002.dcm")),
         (
-            set_values(2, ImageOrientationPatient=[1, 0.001, 0, -0.001, 1, 0]),
+            set_values(only=2, ImageOrientationPatient=[1, 0.001, 0, -0.001, 1, 0]),
             ("ImageOrientationPatient", "slice002.dcm"),
         ),
-        (set_values(2, ImageOrientationPatient=[1, 0.002, 0, 0, 1, 0]), ("ImageOrientationPatient", "slice002.dcm")),
-        (set_values(2, ImageOrientationPatient=[0, 0, 0, 0, 0, 0]), (-398.75, -396.25, "missing")),
+        (
+            set_values(only=2, ImageOrientationPatient=[1, 0.002, 0, 0, 1, 0]),
+            ("ImageOrientationPatient", "slice002.dcm"),
+        ),
+        (set_values(only=2, ImageOrientationPatient=[0, 0, 0, 0, 0, 0]), (-398.75, -396.25, "missing")),
     ],
     ids=["frame of reference", "spacing", "spread", "skew", "zeros"],
 )

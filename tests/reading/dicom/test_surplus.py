@@ -236,13 +236,15 @@ def test_zeros_behind_the_element_of_pixels_are_refused_unless_forced(tmp_path):
 
 
 # --- sent as text ---
+NOISY = Plan(shape=(3, 80, 80), name=NAME)
+NOISY_SLICE_BYTES = 2 * 80 * 80
+
+
 def put_noise(ds, k):
-    values = np.random.default_rng(k).integers(0, 4000, 6400)
+    """Pixels for a slice of `NOISY`, among which line ends of both kinds are."""
+    values = np.random.default_rng(k).integers(0, 4000, 80 * 80)
     values[::50] = int.from_bytes(b"\r\n", "little")
     ds.PixelData = values.astype("<i2").tobytes()
-
-
-NOISY = Plan(shape=(3, 80, 80), name=NAME)
 
 
 @pytest.mark.parametrize("syntax", [ExplicitVRLittleEndian, ImplicitVRLittleEndian])
@@ -252,9 +254,9 @@ def test_series_whose_line_ends_were_changed_as_of_text_is_refused(tmp_path, syn
     write_slices(tmp_path, put_noise, syntax, NOISY)
     for file in tmp_path.iterdir():
         data = file.read_bytes()
-        start = 132 if whole else len(data) - 2 * 6400
+        start = 132 if whole else len(data) - NOISY_SLICE_BYTES
         file.write_bytes(data[:start] + data[start:].replace(old, new))
-    facts = {b"\n": ("text",), b"\r\n": ("truncated", 12800), b"\r": ("elements", "DICOM")}
+    facts = {b"\n": ("text",), b"\r\n": ("truncated", NOISY_SLICE_BYTES), b"\r": ("elements", "DICOM")}
     with refused(RefusedInputError, *("IM0000",) if whole else facts[old]):
         read_volume(tmp_path)
 
@@ -265,7 +267,7 @@ def test_frames_whose_line_ends_were_changed_as_of_text_are_refused(tmp_path, ta
     put_noise(ds, 1)
     ds.PixelData *= 3
     data = save_bytes(ds)
-    head, pixels = data[:-38400], data[-38400:]
+    head, pixels = data[: -3 * NOISY_SLICE_BYTES], data[-3 * NOISY_SLICE_BYTES :]
     for changed in (pixels.replace(b"\n", b"\r\n"), pixels.replace(b"\r\n", b"\n")):
         (tmp_path / "one").write_bytes(head + changed + tail)
         assert_refused_with(tmp_path, "one")

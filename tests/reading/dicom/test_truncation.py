@@ -44,10 +44,10 @@ def test_series_with_a_slice_cut_anywhere_is_refused_unless_no_pixel_is_lost(tmp
             assert cut.name in text or len(seed.series) == 1
         except ClreconError:
             assert len(seed.series) == 1  # nothing is left of the only file
-            assert length < 140
+            assert length < 140  # preamble and mark are 132, the head of the first element 8
         else:
             if length == 0:  # an empty file without an extension is nobody's slice
-                assert volume.voxels.shape[0] == 2
+                assert volume.voxels.shape[0] == len(seed.series) - 1
                 assert volume.report["files"]["skipped"] == {"not DICOM": 1}
                 continue
             # Nothing is missed where a few bytes of padding, or the end mark of the last item, are gone.

@@ -30,6 +30,7 @@ def warnings_with(report, words):
     return [warning for warning in report["warnings"] if words in warning]
 
 
+# Offsets in mm from even steps of 1.25 mm, which a plan has by default.
 UNEVEN = pytest.mark.parametrize(
     ("offsets", "words"),
     [
@@ -169,7 +170,7 @@ def test_noise_of_positions_within_the_tolerance_is_even_without_a_warning(noisy
     volume, _ = noisy_positions
     assert not volume.uneven
     assert volume.report["warnings"] == []
-    tolerance_mm = 1.25 / 100  # a hundredth of the gap
+    tolerance_mm = Plan().gap / 100
     assert 0 < volume.report["grid_residual_rms_mm"] < volume.report["grid_residual_max_mm"] < tolerance_mm
 
 

@@ -76,7 +76,7 @@ def test_big_endian_nifti_is_read(tmp_path, kind, stored):
 @pytest.mark.parametrize("name", WRITERS)
 @pytest.mark.parametrize("stored", ["f4", "f8"])
 def test_fractions_are_read_as_float32(tmp_path, name, stored):
-    voxels = make_ct().astype(stored) + np.random.default_rng(1).random((4, 6, 7)).astype(stored)
+    voxels = make_ct((4, 6, 7)).astype(stored) + np.random.default_rng(1).random((4, 6, 7)).astype(stored)
     volume = clrecon.read_volume(WRITERS[name](tmp_path / name, voxels, OBLIQUE))
     assert volume.voxels.dtype == np.float32
     assert np.array_equal(volume.voxels, voxels.astype(np.float32))
@@ -94,7 +94,7 @@ def test_value_beyond_int16_in_one_slice_widens_the_type_of_the_whole_volume(tmp
 
 @pytest.mark.parametrize("name", [name for name in WRITERS if name != "two.nii"])  # it does not read NIfTI-2
 def test_grid_file_is_read_as_simpleitk_reads_it(tmp_path, name):
-    path = WRITERS[name](tmp_path / name, make_ct(), ROTATED)
+    path = WRITERS[name](tmp_path / name, make_ct((4, 6, 7)), ROTATED)
     volume, image = clrecon.read_volume(path), sitk.ReadImage(str(path))
     assert np.array_equal(volume.voxels, sitk.GetArrayFromImage(image))
     ijk = np.array([[0, 0, 0], [6, 0, 0], [0, 5, 0], [0, 0, 3], [3, 2, 1]])  # corners and one within
@@ -112,7 +112,7 @@ def test_nifti_is_read_as_nibabel_reads_it(tmp_path, name):
 
 @pytest.mark.parametrize("name", ["a.mha", "packed.mha", "a.mhd", "packed.mhd"])
 def test_left_handed_metaimage_is_read_as_simpleitk_reads_it(tmp_path, name):
-    path = WRITERS[name](tmp_path / name, make_ct(), LEFT_HANDED)
+    path = WRITERS[name](tmp_path / name, make_ct((4, 6, 7)), LEFT_HANDED)
     volume, image = clrecon.read_volume(path), sitk.ReadImage(str(path))
     assert np.array_equal(volume.voxels, sitk.GetArrayFromImage(image))
     for ijk in ((0, 0, 0), (6, 5, 3)):  # first and last voxel
@@ -185,7 +185,7 @@ def test_nan_is_read_as_air_with_a_warning_and_its_share(tmp_path):
 )
 @pytest.mark.parametrize("with_nan", [False, True])
 def test_value_beyond_float32_is_refused_with_its_slice(tmp_path, value, message, with_nan):
-    voxels = make_ct().astype(np.float64) + 0.5
+    voxels = make_ct((4, 6, 7)).astype(np.float64) + 0.5
     voxels[2, 1, 1] = value
     if with_nan:
         voxels[2, 0] = np.nan
@@ -194,7 +194,7 @@ def test_value_beyond_float32_is_refused_with_its_slice(tmp_path, value, message
 
 
 def test_whole_number_beyond_float32_is_refused_with_its_slice(tmp_path):
-    voxels = make_ct().astype(np.float64)
+    voxels = make_ct((4, 6, 7)).astype(np.float64)
     voxels[2, 1, 1] = 1e300
     with refused(RefusedInputError, "float32", 3, 4):  # slice 3 of 4
         clrecon.read_volume(write_nrrd(tmp_path / "a.nrrd", voxels))
@@ -206,7 +206,7 @@ def test_volume_of_nan_alone_is_refused(tmp_path):
 
 
 def test_integer_beyond_32_bits_is_refused_with_its_slice(tmp_path):
-    voxels = make_ct().astype(np.int64)
+    voxels = make_ct((4, 6, 7)).astype(np.int64)
     voxels[1, 0, 0] = 2**40
     with refused(RefusedInputError, 2, 4, 32):  # slice 2 of 4, and the bits
         clrecon.read_volume(write_metaimage(tmp_path / "a.mha", voxels))
@@ -285,7 +285,7 @@ def test_grid_file_is_read_in_the_memory_of_two_volumes(tmp_path, name, kind):
 
 @pytest.fixture(scope="module")
 def tilted_torus(tmp_path_factory):
-    """A DICOM series of a torus from a tilted gantry, as a volume."""
+    """A DICOM series of a torus from a tilted gantry, 48 columns wide, as a volume; 250 HU are on its surface."""
     folder = tmp_path_factory.mktemp("torus") / "ct"
     write_phantom(folder, PhantomSettings(kind="torus", size=(48, 44), slices=20, spacing=(0.7, 0.5, 2.5), tilt=12.0))
     return clrecon.read_volume(folder)
@@ -305,7 +305,8 @@ def test_isosurface_of_a_volume_is_the_same_from_every_kind_of_file(tilted_torus
 def test_isosurface_is_the_same_from_a_file_with_its_axes_in_another_order(tilted_torus, tmp_path, device):
     expected = clrecon.extract_isosurface(tilted_torus, 250, device=device)
     reordered = tilted_torus.voxels.transpose(1, 2, 0)[:, ::-1]  # what was i runs down the rows, from the other end
-    reorder = np.array([[0, -1.0, 0, 47], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+    last_column = tilted_torus.voxels.shape[2] - 1
+    reorder = np.array([[0, -1.0, 0, last_column], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
     path = write_nrrd(tmp_path / "t.nrrd", reordered, tilted_torus.affine @ reorder)
     mesh = clrecon.extract_isosurface(clrecon.read_volume(path), 250, device=device)
     assert mesh.vertex_count == expected.vertex_count

@@ -81,8 +81,8 @@ def test_option_for_dicom_alone_is_refused_for_a_grid_file(tmp_path, option):
 
 
 def test_options_for_dicom_at_their_defaults_are_accepted_for_a_grid_file(tmp_path):
-    path = WRITERS["a.nii"](tmp_path / "a.nii", make_ct(), OBLIQUE)
-    assert clrecon.read_volume(path, None, allow_gaps=False, phase=None).voxels.shape == (4, 6, 7)
+    path = WRITERS["a.nii"](tmp_path / "a.nii", make_ct((4, 6, 7)), OBLIQUE)
+    assert clrecon.read_volume(path, series=None, allow_gaps=False, phase=None).voxels.shape == (4, 6, 7)
 
 
 def test_choice_of_a_series_is_refused_where_a_grid_file_is_listed(tmp_path):
@@ -104,6 +104,7 @@ def test_grid_file_whose_package_is_missing_is_refused_with_its_name(tmp_path, m
 
 @pytest.fixture(params=WRITERS)
 def grid_file(request, tmp_path):
+    """A volume of 4 slices of 6 x 7 voxels in one of the formats, and with one of the encodings of each."""
     return WRITERS[request.param](tmp_path / request.param, make_ct((4, 6, 7)), OBLIQUE)
 
 

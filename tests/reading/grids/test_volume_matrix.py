@@ -18,6 +18,7 @@ OTHERS = ("SimpleITK", "nibabel", "pynrrd")
 
 @pytest.fixture(scope="module")
 def rows() -> dict[str, dict[str, str]]:
+    """The rows of the table on the page, by the name of the volume; the cells of each by the name of the reader."""
     text = (ROOT / "docs" / "calibration.md").read_text(encoding="utf-8")
     lines = find_table(text, "volumes that were written").splitlines()
     head, _, *cells = [[cell.strip().replace("`", "") for cell in line.strip("|").split("|")] for line in lines]
@@ -29,8 +30,8 @@ def test_table_of_the_page_has_a_row_for_every_exported_volume(rows: dict[str, d
     assert len(NAMES) >= 60  # 16 scans in four kinds of files
 
 
-WRITTEN = [pair for pair in EXPORTS if not pair[0].refused(pair[1])]
-REFUSED = [pair for pair in EXPORTS if pair[0].refused(pair[1])]
+WRITTEN = [(export, extension) for export, extension in EXPORTS if not export.refused(extension)]
+REFUSED = [(export, extension) for export, extension in EXPORTS if export.refused(extension)]
 
 
 def names_of(exports: list[tuple[Export, str]]) -> list[str]:
@@ -54,11 +55,12 @@ def test_other_readers_get_an_exported_volume_exactly_or_refuse_it_as_the_page_s
     path, _ = write_export(export, extension, tmp_path)
     for reader in OTHERS:
         cell = rows[f"{export.name}, {extension}"][reader]
+        _, read, _ = PEERS[reader]
         if cell == "R":
             with pytest.raises(RuntimeError):
-                PEERS[reader][1](path)
+                read(path)
         elif cell != "-":  # it reads files of this extension
-            assert describe((*PEERS[reader][1](path), False), export.truth()) == cell == "0", reader
+            assert describe((*read(path), False), export.truth()) == cell == "0", reader
 
 
 @pytest.mark.parametrize(("export", "extension"), REFUSED, ids=names_of(REFUSED))

@@ -147,7 +147,7 @@ def test_nrrd_holds_the_frame_of_reference_on_request(tmp_path):
 
 
 def test_metaimage_of_a_resampled_volume_holds_its_certificate(tmp_path):
-    straight = resample_volume(read_scan(tmp_path, "tilted"), 1.0)
+    straight = resample_volume(read_scan(tmp_path, "tilted"), to=1.0)
     write_volume(straight, tmp_path / "a.mha")
     image = sitk.ReadImage(str(tmp_path / "a.mha"))
     lines = [image.GetMetaData(key) for key in image.GetMetaDataKeys() if key.startswith("clrecon_")]
@@ -200,7 +200,7 @@ def centres_of_voxels(volume):
 
 
 def test_resampled_volume_of_uneven_slices_has_cubic_voxels_at_right_angles():
-    resampled = resample_volume(uneven(), 0.4)
+    resampled = resample_volume(uneven(), to=0.4)
     assert np.allclose(resampled.spacing, 0.4)
     assert np.allclose(resampled.affine[:3, :3].T @ resampled.affine[:3, :3], 0.4**2 * np.eye(3))
 
@@ -211,7 +211,7 @@ def test_uneven_slices_of_a_linear_field_are_resampled_to_the_same_field():
     values = stack.ijk_to_lps(centres_of_voxels(stack)) @ gradient
     volume = uneven(values.reshape(stack.voxels.shape).astype(np.float32))
 
-    resampled = resample_volume(volume, 0.4)
+    resampled = resample_volume(volume, to=0.4)
 
     places = resampled.ijk_to_lps(centres_of_voxels(resampled))
     ijk_in_stack = volume.lps_to_ijk(places)
@@ -222,7 +222,7 @@ def test_uneven_slices_of_a_linear_field_are_resampled_to_the_same_field():
 
 def test_uneven_slices_are_written_resampled_on_request(tmp_path):
     write_volume(uneven(), tmp_path / "a.mha", resample=0.4)
-    assert sitk.ReadImage(str(tmp_path / "a.mha")).GetSize() == resample_volume(uneven(), 0.4).shape_ijk
+    assert sitk.ReadImage(str(tmp_path / "a.mha")).GetSize() == resample_volume(uneven(), to=0.4).shape_ijk
 
 
 @pytest.mark.parametrize("spacing", [0.0, -1.0, np.nan, 0.001])
