@@ -43,6 +43,7 @@ def temporary(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monk
 
 @pytest.fixture(autouse=True)
 def nothing_left(temporary: Path) -> Any:
+    """Each test leaves no temporary file."""
     yield
     assert list(temporary.iterdir()) == []
 
@@ -167,7 +168,7 @@ def unpack(path: Path, **limits: Any) -> None:
         pass
 
 
-def tar_zeros(path: Path, count: int) -> None:
+def tar_zeros(path: Path, *, count: int) -> None:
     with tarfile.open(path, "w:gz") as tar:
         entry = tarfile.TarInfo("air.dcm")
         entry.size = count
@@ -175,14 +176,14 @@ def tar_zeros(path: Path, count: int) -> None:
 
 
 def test_archive_of_more_than_100_times_its_size_is_refused_beyond_the_free_bytes(tmp_path: Path) -> None:
-    tar_zeros(tmp_path / "bomb.tar.gz", 1 << 20)  # zeros pack a thousand times
+    tar_zeros(tmp_path / "bomb.tar.gz", count=1 << 20)  # zeros pack a thousand times
 
     with refused(RefusedInputError, "bomb.tar.gz", 100):
         unpack(tmp_path / "bomb.tar.gz", free_bytes=(1 << 20) - 1)
 
 
 def test_archive_of_more_than_100_times_its_size_is_unpacked_up_to_the_free_bytes(tmp_path: Path) -> None:
-    tar_zeros(tmp_path / "air.tar.gz", 1 << 20)
+    tar_zeros(tmp_path / "air.tar.gz", count=1 << 20)
 
     with unpacked(tmp_path / "air.tar.gz", ignore_progress, Limits(free_bytes=1 << 20)) as inside:
         assert Path(inside).stat().st_size == 1 << 20
@@ -235,7 +236,7 @@ class Reads:
 def test_packed_tar_file_beyond_its_limits_is_refused_before_it_is_unpacked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    tar_zeros(tmp_path / "bomb.tar.gz", 1 << 26)
+    tar_zeros(tmp_path / "bomb.tar.gz", count=1 << 26)
     opened: list[Reads] = []
 
     def open_noted(path: Path) -> Reads:
@@ -249,7 +250,9 @@ def test_packed_tar_file_beyond_its_limits_is_refused_before_it_is_unpacked(
     assert sum(stream.count for stream in opened) == tarfile.BLOCKSIZE  # the first header
 
 
-@pytest.mark.parametrize(("size", "kind"), [(1 << 20, NoDicomError), ((1 << 24) + 1, RefusedInputError)])
+@pytest.mark.parametrize(
+    ("size", "kind"), [(1 << 20, NoDicomError), ((16 << 20) + 1, RefusedInputError)], ids=["1 MiB", "16 MiB and 1"]
+)
 def test_tar_file_is_damaged_where_a_header_has_more_than_16_mib(
     size: int, kind: type[Exception], tmp_path: Path
 ) -> None:

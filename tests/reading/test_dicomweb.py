@@ -30,6 +30,7 @@ SLICES = 7
 
 @pytest.fixture(scope="module")
 def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of the slices of a tilted scan."""
     folder = tmp_path_factory.mktemp("scan")
     write_series(folder, Plan(tilt_deg=12, angles=(3, 4, -5), shape=(SLICES, 5, 6)))
     return folder
@@ -37,6 +38,7 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def archive(scan: Path) -> Iterator[Archive]:
+    """A server that has the scan, and answers as the standard says unless a test gives it other answers."""
     with running(Archive(scan)) as server:
         yield server
 
@@ -306,6 +308,7 @@ def test_parts_are_the_same_in_whatever_pieces_they_arrive() -> None:
 
 @pytest.fixture
 def netrc(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The file in use, with a password for 127.0.0.1 and another for all hosts."""
     path = tmp_path / "netrc"
     path.write_text("machine 127.0.0.1 login me password sesame\ndefault login all password open\n")
     path.chmod(0o600)
@@ -437,7 +440,8 @@ def test_redirection_out_of_the_encrypted_web_is_refused(
 def test_redirections_without_an_end_are_refused(archive: Archive) -> None:
     archive.answers = [answering(status=302, Location="/again")] * 10
 
-    with refused(RefusedInputError, archive.host, 5):
+    most = 5
+    with refused(RefusedInputError, archive.host, most):
         read_volume(archive.url)
 
 

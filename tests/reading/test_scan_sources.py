@@ -31,6 +31,7 @@ SECRET = "sesame"
 
 @pytest.fixture(scope="module")
 def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the slices of a tilted scan in study/ct."""
     folder = tmp_path_factory.mktemp("scan")
     write_series(folder / "study" / "ct", Plan(tilt_deg=12, angles=(3, 4, -5)))
     return folder
@@ -131,7 +132,7 @@ WRONG_URLS = {
 @pytest.mark.parametrize("what", WRONG_URLS)
 def test_wrong_url_is_refused_in_a_line_without_what_may_be_secret(what: str, tmp_path: Path, printed: Any) -> None:
     pytest.importorskip("fsspec")
-    assert main(["info", WRONG_URLS[what]]) == 3
+    assert main(["info", WRONG_URLS[what]]) == UsageError.exit_code
 
     told = printed()
     assert told.error_lines == 1
@@ -162,7 +163,7 @@ def test_url_of_a_series_may_end_with_a_slash() -> None:
 @pytest.mark.parametrize("command", ["cloud", "view"])
 def test_mesh_or_cloud_behind_a_url_is_refused(command: str, tmp_path: Path, printed: Any) -> None:
     output = ["-o", str(tmp_path / "c.ply")] if command == "cloud" else []
-    assert main([command, "https://a.example/scan.ply", *output]) == 3
+    assert main([command, "https://a.example/scan.ply", *output]) == UsageError.exit_code
     printed().assert_error(".ply", "URL")
 
 
@@ -176,6 +177,7 @@ def test_label_map_behind_a_url_is_refused() -> None:
 
 @pytest.fixture
 def server() -> Iterator[Server]:
+    """A web server with the answers that a test gives it, else 404."""
     with running(Server()) as server:
         yield server
 
@@ -184,7 +186,7 @@ def test_archive_of_the_web_is_read_as_its_folder(server: Server, packed: bytes,
     server.answers = [answering(packed, "application/zip")]
 
     assert_read_as(f"http://{server.host}/a%20scan.zip?key=1", scan)
-    assert server.asked[0][0] == "/a%20scan.zip?key=1"
+    assert [path for path, _headers in server.asked] == ["/a%20scan.zip?key=1"]
 
 
 def test_file_of_the_web_that_was_cut_is_fetched_again(

@@ -84,7 +84,7 @@ def test_presets_of_projections_have_their_modes_and_windows() -> None:
         ("spine", 50, 100, 0.3, 0.8),
         ("lung", -850, 100, 0.3, 0.8),
         ("metal", 1000, 10, 0.3, 0.8),
-        # Solid: next to nothing transmitted_share.
+        # Solid: next to nothing comes through.
         ("bone", 400, 10, 0, 0.05),
         ("spine", 400, 10, 0, 0.05),
         ("skin", -300, 2, 0, 0.01),

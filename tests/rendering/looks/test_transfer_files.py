@@ -118,7 +118,9 @@ def make_full_function() -> TransferFunction:
         points,
         unit_distance=1 / 3,
         gradient_opacity=[(0, 0.1), (1 / 7, 1)],
-        lighting=Lighting(0.1, 0.7, 0.3, 99, direction=(1, 2, 3), soft_gradient=1 / 3),
+        lighting=Lighting(
+            ambient=0.1, diffuse=0.7, specular=0.3, specular_power=99, direction=(1, 2, 3), soft_gradient=1 / 3
+        ),
         name='a "b" \u00e4\n',
         description="d\\e",
     )
@@ -156,7 +158,8 @@ def example() -> tuple[str, str]:
 
 
 def test_example_of_the_page_on_transfer_functions_is_read(example: tuple[str, str], tmp_path: Path) -> None:
-    function = load_transfer_function(write_file(tmp_path, example[0]))
+    content, _table = example
+    function = load_transfer_function(write_file(tmp_path, content))
 
     assert (function.name, function.unit_distance, len(function.points)) == ("glass bone", 1.0, 3)
     assert function([150])[0].tolist() == pytest.approx([204 / 255, 128 / 255, 102 / 255, 0], abs=FLOAT64_SHARE)
@@ -304,7 +307,7 @@ def test_pipe_as_a_transfer_file_is_refused(tmp_path: Path) -> None:
 def test_slicer_text_is_read_with_its_opacities_colours_and_light(text: str, tmp_path: Path) -> None:
     function = load_transfer_function(write_file(tmp_path, text, "a.vp"))
 
-    assert function.lighting == Lighting(0.15, 0.8, 0.3, 12)
+    assert function.lighting == Lighting(ambient=0.15, diffuse=0.8, specular=0.3, specular_power=12)
     assert (function.gradient_opacity, function.unit_distance) == (None, 1.0)
     opacity = function([-2000, 79.9, 80, 490, 900, 3000])[:, 3]  # 490 lies half way from 80 to 900
     np.testing.assert_allclose(opacity, [0, 0, 0.25, 0.5, 0.75, 0.75], atol=FLOAT64_SHARE)
@@ -326,7 +329,7 @@ def test_slicer_text_without_a_diffuse_part_has_that_of_vtk(tmp_path: Path) -> N
     lines = TEXT.splitlines()
     lines[2] = lines[7] = ""  # diffuse, and the gradient opacity
     function = load_transfer_function(write_file(tmp_path, "\n".join(lines), "a.vp"))
-    assert function.lighting == Lighting(0.15, 0.7, 0.3, 12)
+    assert function.lighting == Lighting(ambient=0.15, diffuse=0.7, specular=0.3, specular_power=12)
 
 
 @pytest.mark.parametrize(
@@ -368,7 +371,10 @@ def presets_xml(tmp_path: Path) -> Path:
 def test_preset_of_slicer_is_read_by_its_name_in_any_case(presets_xml: Path) -> None:
     function = load_transfer_function(presets_xml, "ct-one")
 
-    assert (function.name, function.lighting) == ("CT-One", Lighting(0.1, 0.9, 0.2, 10))
+    assert (function.name, function.lighting) == (
+        "CT-One",
+        Lighting(ambient=0.1, diffuse=0.9, specular=0.2, specular_power=10),
+    )
     assert function.points.tolist() == [[100, 1, 0, 0, 0], [400, 1, 1, 1, 0.5]]
     assert np.array_equal(function.gradient_opacity, [[0, 0.5], [200, 1]])
 
@@ -413,7 +419,10 @@ COMPONENT = ["volumeProperties", 0, "components", 0]
 def test_json_of_slicer_is_read_with_its_distance_light_gradient_and_step_of_opacity(tmp_path: Path) -> None:
     function = load_transfer_function(write_file(tmp_path, SLICER, "a.vp.json"))
 
-    assert (function.unit_distance, function.lighting) == (2.5, Lighting(0.2, 1, 0, 1))
+    assert (function.unit_distance, function.lighting) == (
+        2.5,
+        Lighting(ambient=0.2, diffuse=1, specular=0, specular_power=1),
+    )
     assert np.array_equal(function.gradient_opacity, [[0, 0.25], [100, 1]])
     opacity = function([0, 100, 199.9999, 200.0001, 1000])[:, 3]
     np.testing.assert_allclose(opacity, [0, 0.3, 0.6, 0.1, 0.1], atol=STEP_SIDE)

@@ -57,14 +57,14 @@ def test_transfer_function_of_one_point_is_constant() -> None:
 def test_table_of_a_transfer_function_has_its_values_at_evenly_spaced_hu() -> None:
     function = TransferFunction(STEPPED)
 
-    table = function.table(-100, 300, 5)
+    table = function.table(low=-100, high=300, nodes=5)
 
     assert (table.dtype, table.shape) == (np.float32, (5, 4))
     np.testing.assert_array_equal(table, function([-100, 0, 100, 200, 300]).astype(np.float32))
 
 
 def test_nodes_of_a_table_beside_a_step_do_not_mix_its_sides() -> None:
-    below, above = TransferFunction(STEPPED).table(99.5, 100.5, 2)[:, 3]
+    below, above = TransferFunction(STEPPED).table(low=99.5, high=100.5, nodes=2)[:, 3]
     assert below == pytest.approx(0.2 * 99.5 / 100, abs=STEP_SIDE)
     assert above == pytest.approx(0.6 + 0.4 * 0.5 / 200, abs=STEP_SIDE)
 
@@ -72,22 +72,22 @@ def test_nodes_of_a_table_beside_a_step_do_not_mix_its_sides() -> None:
 def test_table_of_a_step_alone_changes_in_its_middle() -> None:
     step = TransferFunction([(200, 1, 1, 1, 0.0), (200, 1, 1, 1, 1.0)])
 
-    opacity = step.table(*step.range_hu, 4096)[:, 3]
+    opacity = step.table(*step.range_hu, nodes=4096)[:, 3]
 
     assert opacity[:2048].max() == 0
     assert opacity[2048:].min() == 1
 
 
-@pytest.mark.parametrize("table", [(0, 1, 1), (1, 0, 4), (0, np.inf, 4), (np.nan, 1, 4)])
-def test_table_of_fewer_than_two_nodes_or_no_range_is_refused(table: tuple[float, float, int]) -> None:
+@pytest.mark.parametrize(("low", "high", "nodes"), [(0, 1, 1), (1, 0, 4), (0, np.inf, 4), (np.nan, 1, 4)])
+def test_table_of_fewer_than_two_nodes_or_no_range_is_refused(low: float, high: float, nodes: int) -> None:
     with refused(UsageError, "two", "nodes", "lower", "higher"):
-        TransferFunction(STEPPED).table(*table)
+        TransferFunction(STEPPED).table(low, high, nodes)
 
 
 def test_gradient_opacity_is_linear_between_its_points_with_a_step() -> None:
     function = TransferFunction(STEPPED, gradient_opacity=[(10, 0), (50, 1), (50, 0.5)])  # HU per mm, factor
     assert function.gradient_factor([0, 10, 30, 50, 1000]).tolist() == [0, 0, 0.5, 0.5, 0.5]
-    assert function.gradient_table(60, 3).tolist() == [0, 0.5, 0.5]  # at 0, 30 and 60
+    assert function.gradient_table(high=60, nodes=3).tolist() == [0, 0.5, 0.5]  # at 0, 30 and 60
 
 
 def test_gradient_factor_is_1_without_a_gradient_opacity() -> None:
@@ -122,6 +122,7 @@ def test_attribute_of_a_transfer_function_cannot_be_set(name: str) -> None:
 
 @pytest.fixture
 def named_function() -> TransferFunction:
+    """The points of `STEPPED` with every other field."""
     return TransferFunction(STEPPED, unit_distance=2, gradient_opacity=[(0, 1), (5, 0)], name="x", lighting=UNSHADED)
 
 
@@ -260,7 +261,9 @@ def test_light_by_default_has_no_direction_of_its_own_and_shades() -> None:
 
 
 @pytest.mark.parametrize(
-    ("light", "shades"), [(Lighting(1, 0, 0.1), True), (UNSHADED, False)], ids=["highlights alone", "none"]
+    ("light", "shades"),
+    [(Lighting(ambient=1, diffuse=0, specular=0.1), True), (UNSHADED, False)],
+    ids=["highlights alone", "none"],
 )
 def test_light_shades_where_it_has_a_diffuse_or_specular_part(light: Lighting, shades: bool) -> None:
     assert light.shades == shades

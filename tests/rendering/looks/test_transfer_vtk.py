@@ -18,7 +18,7 @@ vtk_data = pytest.importorskip("vtkmodules.vtkCommonDataModel")
 vtk_core = pytest.importorskip("vtkmodules.vtkRenderingCore")
 
 STEPPED = [(0, 0, 0, 0, 0), (100, 1, 1, 1, 0.2), (100, 1, 0, 0, 0.6), (300, 1, 1, 0.5, 1)]
-LIGHT = Lighting(0.1, 0.9, 0.3, 20)
+LIGHT = Lighting(ambient=0.1, diffuse=0.9, specular=0.3, specular_power=20)
 
 
 def make_property(opacity, colors):
@@ -55,7 +55,7 @@ def test_unit_distance_and_light_of_vtk_are_those_of_the_transfer_function(of_st
     _, prop = of_stepped
     assert prop.GetScalarOpacityUnitDistance() == 2.5
     light = (prop.GetAmbient(), prop.GetDiffuse(), prop.GetSpecular(), prop.GetSpecularPower())
-    assert light == (0.1, 0.9, 0.3, 20)
+    assert light == (LIGHT.ambient, LIGHT.diffuse, LIGHT.specular, LIGHT.specular_power)
     assert prop.GetShade() == 1
 
 

@@ -51,7 +51,7 @@ def test_letters_of_an_oblique_view_name_two_and_three_sides():
         ((3, 0, 0), "L"),
         ((-1, -2, -3), "IAR"),
         ((1, 1, 0), "LP"),
-        ((1, 0.04, 0), "L"),
+        ((1, 0.04, 0), "L"),  # less than a twentieth has no letter
         ((1, 0.06, 0), "LP"),
         ((0, -1e-17, -2), "I"),
     ],
@@ -75,13 +75,13 @@ def bent_curve(degrees: float) -> Curve:
     ],
 )
 def test_letter_at_an_edge_along_a_curve_is_true_for_every_row_or_left_out(degrees, letters):
-    made = straightened_sheet(bent_curve(degrees), np.array([0.0, 1.0, 0.0]), (40, 60), 2.0)
+    made = straightened_sheet(bent_curve(degrees), across=np.array([0.0, 1.0, 0.0]), size=(40, 60), pixel=2.0)
     shown = ~np.isnan(made.arc)
     assert sheet_letters(made.sheet, shown) == letters
 
 
 def test_stretched_picture_has_letters_at_its_sides_alone():
-    made = stretched_sheet(bent_curve(60.0), np.array([1.0, 0.0, 0.0]), (40, 60), 2.0)
+    made = stretched_sheet(bent_curve(60.0), across=np.array([1.0, 0.0, 0.0]), size=(40, 60), pixel=2.0)
     letters = sheet_letters(made.sheet, ~np.isnan(made.arc))
     assert (letters["left"], letters["right"]) == ("R", "L") and letters["top"] == letters["bottom"] == ""
 
@@ -128,16 +128,18 @@ def longest_run_of_ink(picture, ink) -> np.ndarray:
 def test_scale_bar_is_as_long_as_its_mm_in_pixels(size, background, ink):
     rng = np.random.default_rng(size[0])
     for scale in rng.uniform(1.0, 400.0, 5):
-        camera = Camera((0, -900, 0), (0, 0, 0), (0, 0, 1), parallel_scale=scale)
+        camera = Camera(position=(0, -900, 0), focal_point=(0, 0, 0), up=(0, 0, 1), parallel_scale=scale)
         picture = make_picture(size, background, camera)
         picture.image[:] = background
         marked = picture.annotated(scale_bar=True)
-        pixel = 2 * scale / size[1]
-        assert abs(longest_run_of_ink(marked, ink).max() - bar_length(pixel * size[0]) / pixel) <= HALF_A_PIXEL
+        width, height = size
+        pixel_mm = 2 * scale / height
+        expected = bar_length(pixel_mm * width) / pixel_mm
+        assert abs(longest_run_of_ink(marked, ink).max() - expected) <= HALF_A_PIXEL
 
 
 def test_scale_bar_on_white_is_black_and_leaves_the_other_pixels():
-    picture = make_picture((300, 200), WHITE)  # 1 mm a pixel
+    picture = make_picture((300, 200), WHITE, PARALLEL)  # 1 mm a pixel: twice the scale of 100 mm over 200 rows
 
     marked = picture.annotated(scale_bar=True)
 
@@ -176,7 +178,7 @@ def test_letters_stand_at_each_edge_and_stand_out_from_the_background(background
     assert columns.min() <= near and columns.max() >= 400 - near
     assert rows.min() <= near and rows.max() >= 300 - near
     assert (marked.image[..., 3][changed] > 0).all()  # seen on a transparent background too
-    at_the_left = marked.image[140:160, :20].reshape(-1, 4)
+    at_the_left = marked.image[140:160, :20].reshape(-1, 4)  # around the middle row, 150
     greys = at_the_left[at_the_left[:, 3] == 255, 0].astype(int)
     assert np.ptp(greys) >= 120  # of 255: ink and its rim
 

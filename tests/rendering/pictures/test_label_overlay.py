@@ -29,7 +29,8 @@ GREY[..., 3] = 255
 RED, BLUE = np.array([255, 0, 0]), np.array([0, 0, 255])
 
 
-def draw_over_grey(opacity=None, colors=None, image=GREY):
+def draw_over_grey(*, opacity=None, colors=None, image=GREY):
+    """The labels, 1 red and 2 blue unless `colors` says otherwise, over an even grey of 100."""
     colors = {1: "#ff0000", 2: "#0000ff"} if colors is None else colors
     return draw_labels(image, NUMBERS, LabelStyle.of(LABELS, colors, opacity), opacity)
 
@@ -61,17 +62,17 @@ def test_pixels_beside_labels_and_the_given_image_stay() -> None:
 
 
 def test_label_with_a_given_opacity_is_filled_by_it_and_outlined_in_full() -> None:
-    made = draw_over_grey({2: 0.8})
+    made = draw_over_grey(opacity={2: 0.8})
     assert (made[INNER_ROWS, INNER_OF_2, :3] == np.rint(0.8 * BLUE + 0.2 * 100)).all()
     assert (made[ROWS, OF_2.stop - 1, :3] == BLUE).all()
 
 
 def test_label_of_opacity_0_has_no_outline_either() -> None:
-    assert (draw_over_grey({1: 0.0})[NUMBERS == 1][:, :3] == 100).all()
+    assert (draw_over_grey(opacity={1: 0.0})[NUMBERS == 1][:, :3] == 100).all()
 
 
 def test_opacity_of_what_has_no_label_leaves_the_scan() -> None:
-    assert np.array_equal(draw_over_grey({0: 0.0}), draw_over_grey())
+    assert np.array_equal(draw_over_grey(opacity={0: 0.0}), draw_over_grey())
 
 
 def test_label_without_a_colour_is_not_drawn() -> None:
@@ -99,12 +100,12 @@ def test_no_label_is_listed_where_none_is_drawn() -> None:
 
 
 def test_pixel_of_a_slice_has_the_label_of_the_voxel_that_it_lies_in() -> None:
-    camera = Camera((11.0, 9.0, -50.0), (11.0, 9.0, 6.0), (0.0, -1.0, 0.0), parallel_scale=20.0)
-    sheet, _ = plane_sheet(camera, (40, 40))
+    camera = Camera(position=(11.0, 9.0, -50.0), focal_point=(11.0, 9.0, 6.0), up=(0.0, -1.0, 0.0), parallel_scale=20.0)
+    sheet, _ = plane_sheet(camera, size=(40, 40))
 
     numbers = labels_on_sheet(LABELS, sheet)
 
-    i, j, k = np.moveaxis(np.floor(sheet.points() / (2.0, 2.0, 3.0) + 0.5).astype(int), -1, 0)
+    i, j, k = np.moveaxis(np.floor(sheet.points() / LABELS.spacing + 0.5).astype(int), -1, 0)
     inside = (0 <= i) & (i < 12) & (0 <= j) & (j < 10) & (0 <= k) & (k < 4)
     expected = np.zeros((40, 40), int)
     expected[inside] = LABELS.voxels[k[inside], j[inside], i[inside]]
@@ -113,5 +114,6 @@ def test_pixel_of_a_slice_has_the_label_of_the_voxel_that_it_lies_in() -> None:
 
 
 def test_slice_beside_a_label_map_has_no_labels() -> None:
-    beside = Camera((0.0, 0.0, 90.0), (0.0, 0.0, 80.0), (0.0, 1.0, 0.0), parallel_scale=20.0)
-    assert not labels_on_sheet(LABELS, plane_sheet(beside, (8, 8))[0]).any()
+    beside = Camera(position=(0.0, 0.0, 90.0), focal_point=(0.0, 0.0, 80.0), up=(0.0, 1.0, 0.0), parallel_scale=20.0)
+    sheet, _ = plane_sheet(beside, size=(8, 8))
+    assert not labels_on_sheet(LABELS, sheet).any()

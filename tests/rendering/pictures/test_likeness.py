@@ -21,27 +21,30 @@ def make_drawn_square(shape=(40, 50), top=10, left=12, size=20) -> np.ndarray:
 
 
 def test_equal_pictures_have_no_error_and_a_likeness_of_1():
-    found = measure_pictures(make_drawn_square(), make_drawn_square())
-    assert (found.mse, found.ssim, found.box) == (0.0, 1.0, (10, 12, 30, 32))
+    square = make_drawn_square(top=10, left=12, size=20)
+    found = measure_pictures(square, square.copy())
+    assert (found.mse, found.ssim, found.box) == (0.0, 1.0, (10, 12, 10 + 20, 12 + 20))
 
 
 def test_pictures_are_compared_in_the_box_of_what_is_drawn_in_either():
-    one, other = make_drawn_square(), make_drawn_square(top=15, left=5)
+    one, other = make_drawn_square(top=10, left=12, size=20), make_drawn_square(top=15, left=5, size=20)
     assert measure_pictures(one, other).box == (10, 5, 15 + 20, 12 + 20)
 
 
 def test_pictures_are_compared_as_a_whole_on_request():
-    assert measure_pictures(make_drawn_square(), make_drawn_square(), whole=True).box == (0, 0, 40, 50)
+    square = make_drawn_square(shape=(40, 50))
+    assert measure_pictures(square, square.copy(), whole=True).box == (0, 0, 40, 50)
 
 
 def test_likeness_of_pictures_is_that_of_scikit_image_and_their_error_the_mean_square():
     from skimage.metrics import structural_similarity
 
-    one, other = make_drawn_square(), np.roll(make_drawn_square(), 1, axis=0)
+    one = make_drawn_square(top=10, left=12, size=20)
+    other = np.roll(one, 1, axis=0)
 
     found = measure_pictures(one, other)
 
-    box = np.s_[10:31, 12:32]  # of both squares
+    box = np.s_[10 : 10 + 20 + 1, 12 : 12 + 20]  # of both squares
     assert found.ssim == pytest.approx(structural_similarity(one[box], other[box], win_size=7, data_range=255))
     assert found.mse == pytest.approx(np.mean((one[box].astype(float) - other[box]) ** 2))
 
@@ -67,7 +70,7 @@ def test_box_of_a_single_pixel_grows_to_the_seven_pixels_of_the_window_of_ssim()
 
 @pytest.mark.parametrize("background", [0, 255], ids=["black", "white"])
 def test_transparent_pictures_are_compared_in_grey_over_the_background(background):
-    grey = make_drawn_square()
+    grey = make_drawn_square(top=10, left=12, size=20)
     is_drawn = grey[:, :, None] > 0
     in_colour = np.where(is_drawn, np.stack([grey] * 3, axis=2), background).astype(np.uint8)
     hidden = 77  # of pixels without opacity
@@ -75,7 +78,7 @@ def test_transparent_pictures_are_compared_in_grey_over_the_background(backgroun
 
     found = measure_pictures(in_colour, transparent, background=(background,) * 3)
 
-    assert found.as_dict() == {"mse": 0.0, "ssim": 1.0, "box": [10, 12, 30, 32]}
+    assert found.as_dict() == {"mse": 0.0, "ssim": 1.0, "box": [10, 12, 10 + 20, 12 + 20]}
 
 
 def test_control_pictures_have_the_form_of_the_original():
@@ -107,7 +110,11 @@ def test_control_picture_of_noise_is_the_same_each_time():
     ("one", "other", "said"),
     [
         (np.zeros((8, 8), np.uint8), np.zeros((8, 8), np.uint8), "nothing is drawn"),
-        (make_drawn_square(), make_drawn_square((41, 50)), r"these have \(40, 50, 1\) and \(41, 50, 1\)"),
+        (
+            make_drawn_square(shape=(40, 50)),
+            make_drawn_square(shape=(41, 50)),
+            r"these have \(40, 50, 1\) and \(41, 50, 1\)",
+        ),
         (np.ones((6, 50), np.uint8), np.ones((6, 50), np.uint8), "50 x 6 pixels is smaller than the window"),
         (make_drawn_square().astype(float), make_drawn_square(), "type uint8, this one has .* and float64"),
     ],

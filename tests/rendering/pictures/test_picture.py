@@ -17,6 +17,7 @@ from clrecon.rendering.looks.colors import COLORS, find_color
 from clrecon.rendering.pictures import picture as image_files
 
 CLEAR = (10, 20, 30, 0)
+PIXEL_MM = 2 * PARALLEL.parallel_scale / 80  # of `make_picture`, by default of 120 x 80 pixels
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.PNG", "a.tif", "a.tiff"])
@@ -28,15 +29,16 @@ def test_saved_picture_has_its_colours_opacity_and_resolution(tmp_path, name):
         assert read.mode == "RGBA"
         assert np.array_equal(np.array(read), picture.image)
         millimetres = 25.4 / np.array(read.info["dpi"], dtype=float)
-    assert millimetres == pytest.approx(200.0 / 80, rel=tolerances.PNG_RESOLUTION)
+    assert millimetres == pytest.approx(PIXEL_MM, rel=tolerances.PNG_RESOLUTION)
 
 
 def test_png_has_its_resolution_in_whole_pixels_a_metre(tmp_path):
     make_picture().save(tmp_path / "a.png")
     data = (tmp_path / "a.png").read_bytes()
-    at = data.index(b"pHYs") + 4
-    assert [int.from_bytes(data[at + n : at + n + 4], "big") for n in (0, 4)] == [400, 400]
-    assert data[at + 8] == 1  # the metre
+    start = data.index(b"pHYs") + 4
+    across, down = (int.from_bytes(data[start + n : start + n + 4], "big") for n in (0, 4))
+    assert across == down == 1000 / PIXEL_MM
+    assert data[start + 8] == 1  # the metre
 
 
 def test_png_of_a_perspective_picture_has_no_resolution(tmp_path):
@@ -74,8 +76,10 @@ def test_png_names_its_software_mode_view_pixel_and_camera(tmp_path):
     assert text["Software"].startswith("clrecon ")
     assert text["Mode"] == "dvr"
     assert text["View"] == "from ALS"
-    assert text["Pixel"] == "2.5 mm"
-    assert text["Camera"].startswith("LPS mm: position 147.721 -255.861 52.0945; focal point 0 0 0; up ")
+    assert text["Pixel"] == f"{PIXEL_MM} mm"
+    x, y, z = 300 * np.array([np.sin(np.pi / 6) * np.cos(np.pi / 18), -np.cos(np.pi / 6) * np.cos(np.pi / 18),
+                              np.sin(np.pi / 18)])  # fmt: skip
+    assert text["Camera"].startswith(f"LPS mm: position {x:.6g} {y:.6g} {z:.6g}; focal point 0 0 0; up ")
     assert text["Camera"].endswith("parallel scale 100 mm")
 
 

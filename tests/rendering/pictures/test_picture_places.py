@@ -15,7 +15,7 @@ CENTRE_MM, RADIUS_MM = 11.5, 8.0
 
 
 @pytest.fixture(scope="module")
-def shot(device):
+def ball_picture(device):
     """A picture of a ball of 8 mm in voxels of 1 mm: its HU fall by 20 a mm, the iso value lies at its radius."""
     k, j, i = np.indices((24, 24, 24)) - CENTRE_MM
     volume = clrecon.Volume((200.0 - 20.0 * np.sqrt(k**2 + j**2 + i**2)).astype(np.float32), np.eye(4))
@@ -23,30 +23,30 @@ def shot(device):
     return clrecon.render(volume, mode="surface", iso_value=level, view=(30.0, 20.0), size=(60, 50), device=device)
 
 
-def test_places_of_the_pixels_of_a_ball_lie_on_it(shot):
-    places = shot.world_points()
+def test_places_of_the_pixels_of_a_ball_lie_on_it(ball_picture):
+    places = ball_picture.world_points()
 
     assert places.shape == (50, 60, 3)
-    hit = np.isfinite(shot.depth)
+    hit = np.isfinite(ball_picture.depth)
     assert hit.sum() > 300  # measured 424, as many pixels as a disc of the radius has
     assert np.linalg.norm(places[hit] - CENTRE_MM, axis=1) == pytest.approx(RADIUS_MM, abs=0.05)  # h^2 / 8 R is 0.02
     assert np.isnan(places[~hit]).all()
 
 
-def test_places_of_pixels_are_the_points_of_the_picture_in_pyvista(shot):
-    hit = np.isfinite(shot.depth)
-    points = shot.to_pyvista().points
-    np.testing.assert_allclose(shot.world_points()[hit], points, atol=1e-4)  # mm in float32
+def test_places_of_pixels_are_the_points_of_the_picture_in_pyvista(ball_picture):
+    hit = np.isfinite(ball_picture.depth)
+    points = ball_picture.to_pyvista().points
+    np.testing.assert_allclose(ball_picture.world_points()[hit], points, atol=1e-4)  # mm in float32
 
 
-def test_picture_is_taken_for_an_array_of_its_image_without_a_copy(shot):
-    assert np.shares_memory(np.asarray(shot), shot.image)
-    assert np.array_equal(np.asarray(shot), shot.image)
+def test_picture_is_taken_for_an_array_of_its_image_without_a_copy(ball_picture):
+    assert np.shares_memory(np.asarray(ball_picture), ball_picture.image)
+    assert np.array_equal(np.asarray(ball_picture), ball_picture.image)
 
 
-def test_picture_is_copied_into_an_array_of_another_type_or_on_request(shot):
-    assert np.array_equal(np.asarray(shot, dtype=float), shot.image)
-    assert not np.shares_memory(np.array(shot, copy=True), shot.image)
+def test_picture_is_copied_into_an_array_of_another_type_or_on_request(ball_picture):
+    assert np.array_equal(np.asarray(ball_picture, dtype=float), ball_picture.image)
+    assert not np.shares_memory(np.array(ball_picture, copy=True), ball_picture.image)
 
 
 @pytest.mark.parametrize(
@@ -55,14 +55,14 @@ def test_picture_is_copied_into_an_array_of_another_type_or_on_request(shot):
 )
 def test_edges_of_a_plane_are_mm_of_the_axes_that_it_runs_along(device, plane, middle, ways):
     volume = clrecon.Volume(np.zeros((4, 6, 8), np.int16), np.eye(4))
-    cut = clrecon.cut_slice(volume, plane, (20, 10), pixel_mm=0.5, device=device)
+    cut = clrecon.cut_slice(volume, plane, size=(20, 10), pixel_mm=0.5, device=device)  # 10 mm wide, 5 mm high
     (across, down), (right, below) = middle, ways
     assert cut.extent == pytest.approx((across - 5 * right, across + 5 * right, down + 2.5 * below, down - 2.5 * below))
 
 
-def test_edges_in_mm_of_a_perspective_picture_are_refused(shot):
+def test_edges_in_mm_of_a_perspective_picture_are_refused(ball_picture):
     with refused(UsageError, "axes", "mm"):
-        _ = replace(shot, camera=replace(shot.camera, parallel_scale=None, view_angle=30.0)).extent
+        _ = replace(ball_picture, camera=replace(ball_picture.camera, parallel_scale=None, view_angle=30.0)).extent
 
 
 def test_places_of_a_picture_along_a_curve_are_refused(device):

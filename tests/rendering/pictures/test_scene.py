@@ -13,10 +13,8 @@ from clrecon.rendering.pictures.picture import merge_layers
 from clrecon.rendering.views.camera import Camera
 
 WIDTH, HEIGHT = 14, 9
-CAMERAS = [
-    Camera((10.0, -400.0, 870.0), (12.0, -30.0, 850.0), (0.2, 0, 1), parallel_scale=60.0),
-    Camera((10.0, -400.0, 870.0), (12.0, -30.0, 850.0), (0.2, 0, 1), view_angle=25.0),
-]
+PLACE = {"position": (10.0, -400.0, 870.0), "focal_point": (12.0, -30.0, 850.0), "up": (0.2, 0, 1)}
+CAMERAS = [Camera(**PLACE, parallel_scale=60.0), Camera(**PLACE, view_angle=25.0)]
 of_each_camera = pytest.mark.parametrize("camera", CAMERAS, ids=["parallel", "perspective"])
 INFINITE = np.float32(np.nan)  # the depth of a pixel that hits nothing
 
@@ -117,7 +115,7 @@ def test_picture_that_has_no_place_in_space_is_refused(camera, asked, says):
         made.to_pyvista(**asked)
 
 
-def one_pixel(color, depth) -> Rendering:
+def one_pixel(*, color, depth) -> Rendering:
     """A picture of one pixel whose expected depth is 2 mm behind its first hit."""
     first = np.full((1, 1), depth, np.float32)
     return Rendering(np.array([[color]], np.uint8), first, first + np.float32(2.0), CAMERAS[0])
@@ -146,7 +144,8 @@ LAYERS = {
 def test_nearer_layer_covers_the_other_as_far_as_it_is_opaque(
     color, depth, scene_color, scene_depth, merged, first, expected
 ):
-    made = merge_layers(one_pixel(color, depth), np.array([[scene_color]], np.uint8), np.array([[scene_depth]]))
+    picture = one_pixel(color=color, depth=depth)
+    made = merge_layers(picture, np.array([[scene_color]], np.uint8), np.array([[scene_depth]]))
 
     assert made.image[0, 0] == pytest.approx(merged, abs=1)  # one grey level of rounding
     assert made.depth[0, 0] == pytest.approx(first, nan_ok=True)
@@ -164,7 +163,7 @@ def test_opaque_picture_without_depth_is_refused_as_a_layer():
     colors, depth = np.zeros((1, 1, 4), np.uint8), np.full((1, 1), np.nan)
 
     with refused(UsageError, "transparent", "background"):
-        merge_layers(one_pixel((255, 255, 255, 255), np.nan), colors, depth)
+        merge_layers(one_pixel(color=(255, 255, 255, 255), depth=np.nan), colors, depth)
 
 
 def test_scene_of_another_size_is_refused_as_a_layer():
