@@ -133,7 +133,7 @@ def test_interrupt_between_two_renames_leaves_one_whole_folder(
     with pytest.raises(KeyboardInterrupt):
         write_animation(frames(2), older)
     assert names(older.parent) == ["turn"] and names(older) == NAMES
-    assert len(done) == 3
+    assert len(done) == 3  # renames
 
 
 @pytest.mark.parametrize("place", [1, 2])

@@ -1,6 +1,8 @@
-"""Sheets of slices: pixels_from_centre panels, lines and circles lie, and what is refused."""
+"""Sheets of slices: where panels, lines and circles lie, and what is refused."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,14 +16,18 @@ pytest.importorskip("PIL")
 RED, GREEN = (255, 0, 0), (0, 255, 0)
 
 
+PIXEL_MM = 0.5
+
+
 def make_panel(*strokes: Stroke, value: float = 300.0) -> Panel:
-    return Panel(np.full((101, 201), value, np.float32), 0.5, (), strokes)
+    """A panel of 201 x 101 pixels of one value in HU, with lines and circles over it."""
+    return Panel(np.full((101, 201), value, np.float32), pixel_mm=PIXEL_MM, strokes=strokes)
 
 
 def pixels_from_centre(image: np.ndarray, color: tuple[int, int, int]) -> np.ndarray:
-    """Rows and columns of the pixels of a colour, within the first make_panel, from its centre."""
+    """Rows and columns of the pixels of a colour, within the first panel, from its centre."""
     found = np.argwhere((image[..., :3] == color).all(axis=-1))
-    return np.asarray(found - GAP_PIXELS - np.array([50, 100]))
+    return np.asarray(found - GAP_PIXELS - np.array([101 // 2, 201 // 2]))
 
 
 def test_line_lies_at_its_mm_in_a_panel() -> None:
@@ -29,22 +35,22 @@ def test_line_lies_at_its_mm_in_a_panel() -> None:
 
     sheet = draw_sheet([[make_panel(line)]])
 
-    assert sheet.pixel_mm == 0.5
+    assert sheet.pixel_mm == PIXEL_MM
     rows, columns = pixels_from_centre(sheet.image, RED).T
-    assert abs(rows.mean() - 10.0 / 0.5) <= 1.0  # pixel
-    assert (columns.min(), columns.max()) == pytest.approx((-20.0 / 0.5, 20.0 / 0.5), abs=1)
+    assert abs(rows.mean() - 10.0 / PIXEL_MM) <= 1.0  # pixel
+    assert (columns.min(), columns.max()) == pytest.approx((-20.0 / PIXEL_MM, 20.0 / PIXEL_MM), abs=1)
 
 
 def test_circle_lies_at_its_mm_in_a_panel() -> None:
-    circle = Stroke(np.array([5.0, 0.0]), GREEN, 10.0)
+    circle = Stroke(np.array([5.0, 0.0]), GREEN, radius_mm=10.0)
 
     sheet = draw_sheet([[make_panel(circle)]])
 
-    middle = np.array([0.0, 5.0 / 0.5])  # row, column
+    middle = np.array([0.0, 5.0 / PIXEL_MM])  # row, column
     radii = np.linalg.norm(pixels_from_centre(sheet.image, GREEN) - middle, axis=1)
     assert len(radii) > 60  # half of the 2 pi 20 pixels of its outline; measured 228, of a stroke of 2 pixels
     width = 2.5  # pixels of the stroke, to each side
-    assert np.abs(radii - 10.0 / 0.5).max() < width
+    assert np.abs(radii - 10.0 / PIXEL_MM).max() < width
 
 
 def test_sheet_of_panels_is_opaque() -> None:
@@ -76,9 +82,9 @@ def test_sheet_that_is_drawn_again_has_the_same_bytes() -> None:
 
 def test_letters_and_caption_of_a_panel_are_drawn_at_its_edges() -> None:
     plain = make_panel()
-    told = Panel(plain.values, 0.5, ["caption"], (), ("L", "R", "A", "P"))
+    with_texts = replace(plain, captions=["caption"], edges=("L", "R", "A", "P"))
     height, width = plain.values.shape
-    difference = (draw_sheet([[told]]).image != draw_sheet([[plain]]).image).any(axis=-1)
+    difference = (draw_sheet([[with_texts]]).image != draw_sheet([[plain]]).image).any(axis=-1)
     rows, columns = np.nonzero(difference)
     near = 14  # pixels; the outlines of the letters begin 3 to 4 from the edges
     assert rows.min() < GAP_PIXELS + near and rows.max() > GAP_PIXELS + height - near

@@ -98,7 +98,7 @@ def test_control_pictures_of_white_and_noise_are_unlike_the_original():
     controls = make_control_pictures(grey)
     errors = {name: measure_pictures(controls[name], grey, whole=True).mse for name in ("white", "black")}
     assert errors["white"] > errors["black"]  # most of the original is black
-    assert measure_pictures(controls["noise"], grey).ssim < 0.1
+    assert measure_pictures(controls["noise"], grey).ssim < 0.02  # measured 0.007
 
 
 def test_control_picture_of_noise_is_the_same_each_time():

@@ -12,14 +12,14 @@ from clrecon.rendering.views.camera import Camera
 
 pyvista = pytest.importorskip("pyvista")
 
-CAMERAS = [
-    Camera((10.1, -400.3, 870.7), (12.0, -30.0, 850.0), (0, 0, 1), parallel_scale=123.4),
-    Camera((10.1, -400.3, 870.7), (12.0, -30.0, 850.0), (0, 0, 1), view_angle=41.7),
-    Camera((0, 0, 900.0), (0, 0, 0), (0, -1, 0), parallel_scale=0.01),
-]
+PLACE = {"position": (10.1, -400.3, 870.7), "focal_point": (12.0, -30.0, 850.0)}
+PARALLEL = Camera(**PLACE, up=(0, 0, 1), parallel_scale=123.4)
+PERSPECTIVE = Camera(**PLACE, up=(0, 0, 1), view_angle=41.7)
+MINUTE_SCALE = Camera(position=(0, 0, 900.0), focal_point=(0, 0, 0), up=(0, -1, 0), parallel_scale=0.01)
 
-
-of_each_camera = pytest.mark.parametrize("camera", CAMERAS, ids=["parallel", "perspective", "minute scale"])
+of_each_camera = pytest.mark.parametrize(
+    "camera", [PARALLEL, PERSPECTIVE, MINUTE_SCALE], ids=["parallel", "perspective", "minute scale"]
+)
 
 
 @of_each_camera
@@ -36,7 +36,7 @@ def test_camera_of_pyvista_has_the_projection_of_ours(camera):
 
 
 def test_camera_with_an_oblique_top_comes_back_with_the_upright_unit_vector_of_the_same_picture():
-    camera = Camera((10.1, -400.3, 870.7), (12.0, -30.0, 850.0), (2.0, 1.0, 3.0), parallel_scale=123.4)
+    camera = Camera(**PLACE, up=(2.0, 1.0, 3.0), parallel_scale=123.4)
 
     back = Camera.from_pyvista(camera.to_pyvista())
 
@@ -62,15 +62,15 @@ def test_vtk_projects_points_to_the_same_pixels(camera):
 
 @pytest.fixture
 def plotter():
-    """A plotter twice as wide as tall with the perspective camera, of 41.7 degrees."""
+    """A plotter of 600 x 300 pixels with the perspective camera."""
     made = pyvista.Plotter(off_screen=True, window_size=(600, 300))
-    made.camera = CAMERAS[1].to_pyvista()
+    made.camera = PERSPECTIVE.to_pyvista()
     yield made
     made.close()
 
 
 def test_plotter_gives_its_camera(plotter):
-    assert Camera.from_pyvista(plotter) == CAMERAS[1]
+    assert Camera.from_pyvista(plotter) == PERSPECTIVE
 
 
 def test_horizontal_angle_of_a_plotter_becomes_the_vertical_one_of_its_window(plotter):
@@ -79,17 +79,17 @@ def test_horizontal_angle_of_a_plotter_becomes_the_vertical_one_of_its_window(pl
     camera = Camera.from_pyvista(plotter)
 
     half_height = np.tan(np.radians(camera.view_angle / 2))
-    assert half_height == pytest.approx(np.tan(np.radians(41.7 / 2)) * 300 / 600)
+    assert half_height == pytest.approx(np.tan(np.radians(PERSPECTIVE.view_angle / 2)) * 300 / 600)
 
 
 def test_horizontal_angle_of_a_square_picture_is_the_vertical_one(plotter):
     plotter.camera.SetUseHorizontalViewAngle(True)
 
-    assert Camera.from_pyvista(plotter, (300, 300)).view_angle == pytest.approx(41.7)
+    assert Camera.from_pyvista(plotter, size=(300, 300)).view_angle == pytest.approx(PERSPECTIVE.view_angle)
 
 
 def test_horizontal_angle_without_a_size_is_refused():
-    made = CAMERAS[1].to_pyvista()
+    made = PERSPECTIVE.to_pyvista()
     made.SetUseHorizontalViewAngle(True)
 
     with refused(UsageError, "size"):
@@ -106,7 +106,7 @@ DISTORTED = {
 
 @pytest.mark.parametrize("distort", DISTORTED.values(), ids=DISTORTED)
 def test_camera_of_vtk_that_ours_cannot_be_is_refused(distort):
-    made = CAMERAS[0].to_pyvista()
+    made = PARALLEL.to_pyvista()
     distort(made)
 
     with refused(UsageError, "VTK", "camera"):

@@ -16,13 +16,18 @@ from clrecon.rendering.views.reformation import straightened_sheet, stretched_le
 RADIUS, TURN_DEG = 80.0, 120.0
 
 
-def arc_points(degrees, count, radius=RADIUS):
+def arc_points(degrees, count):
+    """So many points of a circle of `RADIUS` across x, from y to z."""
     angle = np.radians(np.linspace(0.0, degrees, count))
-    return np.stack([0.0 * angle, radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    return np.stack([0.0 * angle, RADIUS * np.cos(angle), RADIUS * np.sin(angle)], axis=1)
 
 
-def helix(t, radius=20.0, pitch=30.0):
-    return np.stack([radius * np.cos(t), radius * np.sin(t), pitch * t / (2.0 * np.pi)], axis=1)
+HELIX_RADIUS, HELIX_PITCH = 20.0, 30.0  # mm
+
+
+def helix(t):
+    """Points of a helix along z at the angles `t` in radians."""
+    return np.stack([HELIX_RADIUS * np.cos(t), HELIX_RADIUS * np.sin(t), HELIX_PITCH * t / (2.0 * np.pi)], axis=1)
 
 
 @pytest.fixture(scope="module")
@@ -60,12 +65,12 @@ def clicked_helix() -> Curve:
 
 
 def test_equal_steps_of_arc_length_are_as_long_as_the_chords_of_a_fine_polyline(clicked_helix):
-    step = clicked_helix.length / 56
+    steps, chords_a_step = 56, 200
 
-    fine = clicked_helix.at(np.linspace(0.0, clicked_helix.length, 56 * 200 + 1))
+    fine = clicked_helix.at(np.linspace(0.0, clicked_helix.length, steps * chords_a_step + 1))
 
-    chords = np.linalg.norm(np.diff(fine, axis=0), axis=1).reshape(56, 200).sum(axis=1)
-    assert np.abs(chords - step).max() <= tolerances.ARC_STEP_MM
+    lengths = np.linalg.norm(np.diff(fine, axis=0), axis=1).reshape(steps, chords_a_step).sum(axis=1)
+    assert np.abs(lengths - clicked_helix.length / steps).max() <= tolerances.ARC_STEP_MM
 
 
 def test_tangents_are_unit_vectors(clicked_helix):
@@ -90,9 +95,8 @@ def test_repeated_points_count_once():
 
 def test_frames_of_a_helix_turn_back_by_its_torsion():
     """The frame without twist turns against the Frenet frame by the torsion: analytic for a helix."""
-    radius, pitch = 20.0, 30.0
+    radius, rise = HELIX_RADIUS, HELIX_PITCH / (2.0 * np.pi)
     t = np.linspace(0.0, 4.0 * np.pi, 2000)
-    rise = pitch / (2.0 * np.pi)
     speed = np.hypot(radius, rise)
     tangents = np.stack([-radius * np.sin(t), radius * np.cos(t), rise + 0.0 * t], axis=1) / speed
     inward = np.stack([-np.cos(t), -np.sin(t), 0.0 * t], axis=1)
@@ -138,7 +142,8 @@ of_each_angle = pytest.mark.parametrize("angle", [0.0, 90.0, -35.0])
 
 
 def straightened(angle: float):
-    return straightened_sheet(HELIX, TURN[:, 0], (41, 100), PIXEL, angle)
+    """The turned helix made straight in 41 columns and 100 rows, seen across its own x axis."""
+    return straightened_sheet(HELIX, across=TURN[:, 0], size=(41, 100), pixel=PIXEL, angle=angle)
 
 
 @of_each_angle
@@ -172,20 +177,20 @@ def test_straightened_rows_turned_back_by_their_angle_point_to_the_right_on_the_
     made = straightened(angle)
 
     back = np.cos(np.radians(angle)) * made.sheet.steps - np.sin(np.radians(angle)) * PIXEL * made.sheet.normals
-    sides = (np.cross(back, TURN[:, 0]) * HELIX.tangents(made.arc)).sum(axis=1)
-    assert abs(sides.mean()) < 1e-3 * HELIX.length  # of 0.01: to a tenth of the sine of a right angle
+    sines = (np.cross(back / PIXEL, TURN[:, 0]) * HELIX.tangents(made.arc)).sum(axis=1)
+    assert abs(sines.mean()) < 5e-4  # of 1 for a right angle; measured 2e-4
 
 
 ALONG = np.array([0.0, 0.0, 1.0])
-ROUND = Curve(helix(np.linspace(0.0, 1.5, 12)))  # 1.5 radians of a helix on a cylinder of 20 mm
-ROUND_LENGTH = 20.0 * 1.5  # mm, of the helix's circle
+ROUND = Curve(helix(np.linspace(0.0, 1.5, 12)))  # 1.5 radians
+ROUND_LENGTH = HELIX_RADIUS * 1.5  # mm, of the helix's circle
 STRETCHED_PIXEL = ROUND_LENGTH / 400
 
 
 @pytest.fixture(scope="module")
 def unrolled():
-    """The unrolled cylinder of the helix."""
-    return stretched_sheet(ROUND, ALONG, (101, 400), STRETCHED_PIXEL)
+    """The unrolled cylinder of the helix, in 101 columns and 400 rows."""
+    return stretched_sheet(ROUND, across=ALONG, size=(101, 400), pixel=STRETCHED_PIXEL)
 
 
 def test_stretched_length_is_that_across_the_axis():
@@ -193,7 +198,7 @@ def test_stretched_length_is_that_across_the_axis():
 
 
 def test_stretched_axes_run_right_down_and_into_the_picture(unrolled):
-    down = np.diff(unrolled.sheet.points()[:, 50], axis=0)
+    down = np.diff(unrolled.sheet.points()[:, 50], axis=0)  # the middle of 101 columns
 
     axes = np.stack([unrolled.sheet.steps[:-1], down, unrolled.sheet.normals[:-1]], axis=1)
     assert np.linalg.det(axes).min() > 0.0
@@ -222,7 +227,7 @@ of_each_sheet = pytest.mark.parametrize("make", [straightened_sheet, stretched_s
 def test_rows_beyond_the_ends_have_no_arc_length(make):
     curve = Curve([(0, 0, 0), (0, 0, 10)])
 
-    made = make(curve, np.array([1.0, 0.0, 0.0]), (5, 20), 1.0)
+    made = make(curve, across=np.array([1.0, 0.0, 0.0]), size=(5, 20), pixel=1.0)
 
     beyond = [np.nan] * 5  # ten of the twenty rows of 1 mm are on the line of 10 mm
     assert made.arc == pytest.approx([*beyond, *(np.arange(10) + 0.5), *beyond], nan_ok=True)
@@ -249,7 +254,7 @@ def test_view_along_the_whole_centre_line_is_refused(make):
     along = Curve([(0, 0, 0), (0, 0, 10)])
 
     with refused(UsageError, "another", "view"):
-        make(along, np.array([0.0, 0.0, 1.0]), (5, 5), 1.0)
+        make(along, across=np.array([0.0, 0.0, 1.0]), size=(5, 5), pixel=1.0)
 
 
 def test_points_within_half_a_voxel_of_the_volume_are_accepted():

@@ -34,7 +34,7 @@ def test_infinite_sides_of_a_box_have_no_planes():
 
 
 def test_plane_is_its_unit_normal_and_the_height_of_its_point_along_it():
-    clip = Clip.plane((1.0, 2.0, 3.0), (0.0, 3.0, 4.0))
+    clip = Clip.plane(point=(1.0, 2.0, 3.0), normal=(0.0, 3.0, 4.0))
 
     assert clip.planes[0] == pytest.approx([0.0, 3 / 5, 4 / 5, (2.0 * 3 + 3.0 * 4) / 5])
 

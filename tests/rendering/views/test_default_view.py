@@ -35,7 +35,7 @@ def cosine(view, normal: np.ndarray) -> float:
 def test_slices_of_any_direction_are_never_seen_from_their_edge() -> None:
     seen = [cosine(default_view("slices", stack(normal)), normal) for normal in random_normals()]
 
-    assert min(seen) > 0.15  # more than 8 degrees off the edge
+    assert min(seen) > 0.15  # more than 8 degrees off the edge; measured 0.21
 
 
 def test_slices_are_seen_from_the_first_view_that_shows_enough_of_them() -> None:

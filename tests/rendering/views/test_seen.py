@@ -16,9 +16,9 @@ from clrecon.rendering.views.clip import Clip, ShownLabels, check_center, find_s
 AFFINE = np.array([[2.0, 0, 0, -30.0], [0, 3.0, 0, -40.0], [0, 0, 5.0, 100.0], [0, 0, 0, 1]])
 
 
-def block(volume_shape=(12, 20, 24)) -> np.ndarray:
+def block() -> np.ndarray:
     """Return air with a block of 500 HU at i 6 to 9, j 8 to 14, k 3 to 5, and one of 40 HU at i 15, j 2, k 9."""
-    voxels = np.full(volume_shape, -1000, np.int16)
+    voxels = np.full((12, 20, 24), -1000, np.int16)
     voxels[3:6, 8:15, 6:10] = 500
     voxels[9, 2, 15] = 40
     return voxels
@@ -59,7 +59,7 @@ def test_box_of_a_band_holds_what_is_above_its_low_end_and_below_its_high_end():
 
     box = find_seen_box(Volume(voxels, AFFINE), (20.0, 60.0))
 
-    assert extent(box) == between((14, 1, 8), (16, 3, 10))
+    assert extent(box) == between((14, 1, 8), (16, 3, 10))  # the block of 40 HU
 
 
 def test_box_of_everything_holds_both_blocks():
