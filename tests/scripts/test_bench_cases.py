@@ -121,13 +121,11 @@ def test_least_bytes_of_a_surface_are_those_of_its_voxels_its_mask_of_one_bit_an
     assert floors.floor_bytes(voxels, bytes_of_voxel, vertices, triangles, is_cpu=is_cpu) == expected
 
 
-@pytest.mark.parametrize(
-    ("bytes_per_second", "percent"), [(1.0, 50.0), (0.0, None)], ids=["known bandwidth", "unknown bandwidth"]
-)
+@pytest.mark.parametrize(("seconds", "percent"), [(1.0, 50.0), (0.0, None)], ids=["measured time", "no measured time"])
 def test_percent_of_the_floor_is_its_time_at_the_bandwidth_over_the_measured_time(
-    bytes_per_second: float, percent: float | None
+    seconds: float, percent: float | None
 ) -> None:
-    assert floors.share_of_floor(50, 100.0, bytes_per_second) == percent
+    assert floors.share_of_floor(moved=50, bandwidth=100.0, seconds=seconds) == percent
 
 
 @pytest.mark.parametrize(("device_type", "bandwidth"), [("cpu", 30.0), ("gpu", 20.0)])
@@ -146,13 +144,13 @@ def test_share_of_active_bricks_is_that_of_the_layers_that_a_plane_crosses(
 ) -> None:
     voxels = np.zeros((25, 17, 33), np.int16)  # three layers of bricks of 8 cells
     voxels[first_dense_slice:] = 10
-    assert floors.active_brick_share(voxels, 5) == active_layers / 3
+    assert floors.active_brick_share(voxels, lowest_inside=5) == active_layers / 3
 
 
 def test_no_brick_is_active_at_an_iso_value_above_all_voxels() -> None:
     voxels = np.zeros((25, 17, 33), np.int16)
     voxels[9:] = 10
-    assert floors.active_brick_share(voxels, 50) == 0.0
+    assert floors.active_brick_share(voxels, lowest_inside=50) == 0.0
 
 
 @pytest.mark.parametrize(
@@ -204,7 +202,7 @@ def test_iso_values_for_scaling_keep_the_triangles_about_below_the_limit(ramp_in
 def test_iso_values_of_timed_calls_are_all_different() -> None:
     levels = list(islice(isosurface.walk_levels(226.0), 20 * len(isosurface.LEVEL_STEPS)))
     assert len(set(levels)) == len(levels)
-    assert levels[:2] == [226.0, 226.0 + 150.0]
+    assert levels[:2] == [226.0, 226.0 + isosurface.LEVEL_STEPS[1]]
     assert levels[len(isosurface.LEVEL_STEPS)] == 226.0 + 1.0  # the steps begin again
 
 
@@ -247,6 +245,7 @@ def surface_results(device: Any, tmp_path_factory: pytest.TempPathFactory) -> di
 
 @pytest.fixture(params=["isosurface-cold", "isosurface-resident"])
 def surface_result(request: pytest.FixtureRequest, surface_results: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """The result of one of the cases of surfaces, of a cube of 32 voxels a side and three pairs of times."""
     return surface_results[request.param]
 
 
@@ -315,6 +314,7 @@ def test_scaling_is_measured_from_a_part_to_the_whole_volume_with_lines_over_vox
 
 @pytest.fixture(scope="module")
 def picture_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where `picture_results` writes."""
     return tmp_path_factory.mktemp("pictures")
 
 
@@ -333,7 +333,7 @@ def test_ray_casting_is_timed_against_vtk_in_both_projections(
     name: str, picture_results: dict[str, dict[str, Any]]
 ) -> None:
     result = picture_results[name]
-    assert (result["size"], result["ray_step_mm"]) == ([60, 50], 0.25)
+    assert (result["size"], result["ray_step_mm"]) == ([60, 50], 0.25)  # a quarter of a voxel of the cube
     assert set(result["ratios"]) == set(result["sides"]) == {"parallel", "perspective"}
     for side in result["sides"].values():
         assert side["pairs"] == len(side["ours"]) == len(side["theirs"]) == 3
@@ -438,4 +438,4 @@ def test_peak_of_memory_is_that_of_the_measured_call_alone() -> None:
     done = subprocess.run(command, cwd=FOLDER, capture_output=True, text=True, check=True)
     if done.stdout.strip() == "0":
         pytest.skip("this system does not tell resident memory")
-    assert int(done.stdout) == pytest.approx(32 << 20, rel=0.2)
+    assert int(done.stdout) == pytest.approx(32 << 20, rel=0.1)  # a huge page is 6 %; measured 0.6 % less

@@ -12,7 +12,7 @@ from clrecon.errors import NoDicomError
 import outliers  # isort: skip
 
 
-def run_of(cpu_s: float, error: str | None = None) -> outliers.Run:
+def run_of(*, cpu_s: float, error: str | None = None) -> outliers.Run:
     return outliers.Run(wall_s=9.0, cpu_s=cpu_s, memory_bytes=10**9, error=error)
 
 
@@ -26,19 +26,19 @@ def test_timed_command_is_understood_up_to_its_missing_input(
 
 
 def test_command_of_more_than_5_s_stands_out() -> None:
-    assert "over 5 s" in outliers.judge(run_of(5.1), None)
+    assert "over 5 s" in outliers.judge(run_of(cpu_s=5.1), None)
 
 
 def test_command_of_more_than_three_times_its_peer_stands_out_with_the_factor() -> None:
-    assert "3.2 times" in outliers.judge(run_of(3.2), run_of(1.0))
+    assert "3.2 times" in outliers.judge(run_of(cpu_s=3.2), run_of(cpu_s=1.0))
 
 
 @pytest.mark.parametrize(
     ("run", "peer"),
     [
-        pytest.param(run_of(4.9), None, id="below 5 s"),
-        pytest.param(run_of(2.9), run_of(1.0), id="below three times its peer"),
-        pytest.param(run_of(3.2), run_of(1.0, "exit 1: no module"), id="its peer has failed"),
+        pytest.param(run_of(cpu_s=4.9), None, id="below 5 s"),
+        pytest.param(run_of(cpu_s=2.9), run_of(cpu_s=1.0), id="below three times its peer"),
+        pytest.param(run_of(cpu_s=3.2), run_of(cpu_s=1.0, error="exit 1: no module"), id="its peer has failed"),
     ],
 )
 def test_command_within_both_limits_or_beside_a_peer_that_failed_does_not_stand_out(

@@ -22,12 +22,13 @@ PLAN = Plan(shape=(12, 32, 40), pixel_spacing=(0.7, 0.7))
 
 
 def make_job(folder: Path, tmp_path: Path) -> Any:
+    """A job of one pair of times on a series."""
     given = inputs.parse_input(f"small={folder}", tmp_path)
-    return registry.Job(given, 226.0, 1, SimpleNamespace(index=0), 1, 60.0)
+    return registry.Job(given, hu=226.0, pairs=1, device=SimpleNamespace(index=0), peer_threads=1, limit_s=60.0)
 
 
 def test_written_tree_has_three_different_series_of_four_slices(tmp_path: Path) -> None:
-    assert trees.write_tree(tmp_path / "tree", 3, 4) == 3 * 4  # files
+    assert trees.write_tree(tmp_path / "tree", series=3, slices=4) == 3 * 4  # files
     series = list_series(tmp_path / "tree").series
     assert [entry.slices for entry in series] == [4, 4, 4]
     assert len({entry.uid_hash for entry in series}) == 3
@@ -35,7 +36,7 @@ def test_written_tree_has_three_different_series_of_four_slices(tmp_path: Path) 
 
 
 def test_slices_of_a_written_tree_are_a_gap_apart(tmp_path: Path) -> None:
-    trees.write_tree(tmp_path / "tree", 1, 4)
+    trees.write_tree(tmp_path / "tree", series=1, slices=4)
     [entry] = list_series(tmp_path / "tree").series
     assert entry.gap_mm["max"] == trees.GAP_MM
 
@@ -72,7 +73,7 @@ def test_reading_of_a_series_is_timed_against_pydicom_and_simpleitk_warm_and_in_
 @pytest.mark.release
 def test_scan_of_trees_is_timed_against_pydicom_for_each_size(series_folder: Path, tmp_path: Path) -> None:
     sizes = ((2, 3), (4, 5))  # series, slices of each
-    figures = reading.measure_scan_tree(make_job(series_folder, tmp_path), sizes, 1)
+    figures = reading.measure_scan_tree(make_job(series_folder, tmp_path), sizes, runs=1)
     assert [(tree["series"], tree["files"]) for tree in figures["trees"]] == [(2, 2 * 3), (4, 4 * 5)]
     assert set(figures["ratios"]) == {"pydicom_headers"}
     assert figures["processor_seconds_a_file_growth"] > 0

@@ -58,7 +58,8 @@ def test_short_campaign_has_cases_of_every_family() -> None:
 
 def kind_of_outcome(run, is_contradicted=True, limit_s=5.0):
     """The kind of the outcome of damaged input whose reading is `run`; other files may contradict another answer."""
-    return Judge().judge(Trial("a trial", run, UNHARMED, lambda answer: is_contradicted, limit_s)).kind
+    trial = Trial("a trial", run, unharmed=UNHARMED, contradicted=lambda answer: is_contradicted, limit_s=limit_s)
+    return Judge().judge(trial).kind
 
 
 def fail(error):
@@ -158,7 +159,7 @@ for line in sys.stdin:
 def test_campaign_goes_on_with_a_new_worker_after_one_that_died(tmp_path) -> None:
     (tmp_path / "worker.py").write_text(ENDS_AT_CASE_2)
     start_worker = partial(Worker.start, program=tmp_path / "worker.py")
-    campaign = run_campaign(Schedule(["values"], 5), seconds=30, start_worker=start_worker)
+    campaign = run_campaign(Schedule(["values"], most=5), seconds=30, start_worker=start_worker)
     assert campaign.counts == {"values": Counter(same=4, crash=1)}
     assert [str(case) for case, _ in campaign.faults] == ["values:2"]
 
@@ -179,14 +180,15 @@ def test_families_get_their_shares_of_the_time_although_their_cases_take_differe
 
 
 def test_schedule_of_no_cases_draws_none() -> None:
-    assert Schedule(["values"], 0).draw() is None
+    assert Schedule(["values"], most=0).draw() is None
 
 
 @pytest.mark.parametrize(
     "make_trial", [slices.values_trial, slices.bytes_trial, slices.ends_trial, clouds.clouds_trial]
 )
 def test_trial_of_the_same_case_and_seed_is_the_same(make_trial, tmp_path) -> None:
-    first, second = (make_trial(20_000, tmp_path, random.Random("1")).words for _ in range(2))
+    case_number = 20_000
+    first, second = (make_trial(case_number, tmp_path, random.Random("1")).words for _ in range(2))
     assert first == second
 
 
@@ -215,7 +217,7 @@ def test_undamaged_cloud_is_read_and_a_missing_one_refused(name, kind, tmp_path)
     if name in clouds.clouds():
         path.write_bytes(clouds.clouds()[name])
     unharmed = clouds.unharmed_cloud("full.ply")
-    trial = Trial(name, lambda: clouds.answer_of_cloud(path), unharmed, lambda answer: True)
+    trial = Trial(name, lambda: clouds.answer_of_cloud(path), unharmed=unharmed, contradicted=lambda answer: True)
     assert Judge().judge(trial).kind == kind
 
 

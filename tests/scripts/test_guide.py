@@ -76,6 +76,7 @@ def site(shared_folder: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def pages(site: Path) -> dict[str, Page]:
+    """The pages of the Guide by their paths in it."""
     files = [
         path for path in sorted(site.rglob("*.html")) if "_static" not in path.parts
     ]  # there: the theme's templates

@@ -22,12 +22,6 @@ FIGURES = json.loads(measure_kinds.FIGURES.read_text(encoding="utf-8"))
 PAGE = measure_kinds.PAGE.read_text(encoding="utf-8")
 
 
-def measure(shared_folder: Path, tmp_path: Path, device: Any, kind: str, way: str) -> dict[str, Any]:
-    scan, settings = make_scan(shared_folder, kind)
-    options = measure_kinds.WAYS[kind][way]
-    return measure_kinds.measure_way(scan, settings, options, tmp_path, str(device.index))
-
-
 SILENT_VOLUME_SHARE = 0.1
 """The promise of the page: a volume that is further off is warned of."""
 OFF_SURFACE_VOXELS = 0.3
@@ -57,7 +51,9 @@ EVERY_DAY = [("mouse", "default"), ("jaw", "auto"), ("longbone", "auto"), ("hand
 def test_mesh_of_a_kind_of_scan_keeps_the_promises_of_the_page(
     shared_folder: Path, tmp_path: Path, device: Any, kind: str, way: str
 ) -> None:
-    found = measure(shared_folder, tmp_path, device, kind, way)
+    scan, settings = make_scan(shared_folder, kind)
+    options = measure_kinds.WAYS[kind][way]
+    found = measure_kinds.measure_way(scan, settings, options, tmp_path, str(device.index))
     assert found["code"] == 0
     assert_promises(kind, way, found)
 
@@ -121,7 +117,7 @@ def test_commands_of_a_section_of_the_page_exit_as_stated_and_write_their_files(
             arguments += ["--slices", str(SLICES[arguments[arguments.index("--kind") + 1]])]
         assert main([*arguments, "-q"]) == code, arguments
         if "-o" in arguments:
-            assert Path(arguments[arguments.index("-o") + 1]).stat().st_size > 1000
+            assert Path(arguments[arguments.index("-o") + 1]).stat().st_size > 1000  # bytes: more than heads
 
 
 def test_page_of_kinds_of_scan_has_a_section_that_makes_each_kind_once() -> None:

@@ -63,11 +63,11 @@ WHY_EQUAL = EQUIVALENT[OF_EQUAL_RESULTS.kernel, OF_EQUAL_RESULTS.name]
 @pytest.mark.parametrize(
     ("known", "code", "word", "reason"),
     [
-        pytest.param(Known(MUTATION, True), 0, "caught", "compact: why", id="noticed"),
-        pytest.param(Known(MUTATION, False), 1, "SURVIVED", "compact: why", id="not noticed"),
-        pytest.param(Known(MUTATION, None), 1, "BROKEN", "why", id="does not build"),
-        pytest.param(Known(OF_EQUAL_RESULTS, False), 0, "equivalent", WHY_EQUAL, id="of equal results"),
-        pytest.param(Known(OF_EQUAL_RESULTS, True), 1, "CAUGHT", WHY_EQUAL, id="wrongly called equivalent"),
+        pytest.param(Known(MUTATION, caught=True), 0, "caught", "compact: why", id="noticed"),
+        pytest.param(Known(MUTATION, caught=False), 1, "SURVIVED", "compact: why", id="not noticed"),
+        pytest.param(Known(MUTATION, caught=None), 1, "BROKEN", "why", id="does not build"),
+        pytest.param(Known(OF_EQUAL_RESULTS, caught=False), 0, "equivalent", WHY_EQUAL, id="of equal results"),
+        pytest.param(Known(OF_EQUAL_RESULTS, caught=True), 1, "CAUGHT", WHY_EQUAL, id="wrongly called equivalent"),
     ],
 )
 def test_mutated_kernel_is_reported_by_its_outcome_and_fails_the_run_unless_it_is_as_expected(

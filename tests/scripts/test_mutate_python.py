@@ -99,6 +99,7 @@ def test_second():
 
 @pytest.fixture(scope="module")
 def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the package toy, whose room flat is `ROOM`, and its tests."""
     folder = tmp_path_factory.mktemp("project")
     for name, text in {"toy/__init__.py": "", "toy/flat/__init__.py": "", "toy/flat/shapes.py": ROOM}.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -112,6 +113,7 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def copy(project: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Copy]:
+    """A private copy of the project, in which changes are tried."""
     made = Copy.make(project, tmp_path_factory.mktemp("private"), "toy")
     yield made
     made.close()
@@ -119,21 +121,25 @@ def copy(project: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Co
 
 @pytest.fixture(scope="module")
 def trace(copy: Copy) -> Trace:
+    """Which tests run which lines of the room."""
     return copy.trace("flat")
 
 
 def change(before: str, after: str) -> Change:
+    """A change of the one place in `ROOM` where `before` stands."""
     assert ROOM.count(before) == 1
     line = ROOM[: ROOM.index(before)].count("\n") + 1
     return Change("toy/flat/shapes.py", line, "by hand", line, before, after, ROOM.replace(before, after))
 
 
+ALL_TESTS = TESTS.count("def test_")
 MINUS = change("x + 1", "x - 1")
 EQUAL = change("while n > 0", "while n != 0")
 TIMES = change("* width *", "/ width *")
 
 
 def names(trace: Trace, changed: Change) -> set[str]:
+    """The tests that a change is tried with, without test_."""
     lines = statement_lines(ROOM, changed.line)
     return {test.partition("::test_")[2] for test in trace.tests_of(changed.file, lines)}
 
@@ -260,7 +266,7 @@ def test_change_that_makes_a_test_run_on_is_caught_by_its_processor_time(
     copy: Copy, trace: Trace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Trace, "limit_s", lambda self, tests: 3.0)
-    assert copy.try_change(change("n -= 1", "n += 1"), trace) == ("time", 6)
+    assert copy.try_change(change("n -= 1", "n += 1"), trace) == ("time", ALL_TESTS)
 
 
 @pytest.mark.release
@@ -269,19 +275,19 @@ def test_change_that_makes_a_test_wait_is_late_and_neither_caught_nor_survived(
 ) -> None:
     monkeypatch.setattr(copy, "times_wall", 0.0)
     monkeypatch.setattr(copy, "and_wall_s", 1.0)
-    assert copy.try_change(change("n -= 1", "__import__('time').sleep(60.0)"), trace) == ("late", 6)
+    assert copy.try_change(change("n -= 1", "__import__('time').sleep(60.0)"), trace) == ("late", ALL_TESTS)
 
 
 @pytest.mark.release
 def test_change_that_ends_the_process_of_its_tests_is_caught_as_a_crash(copy: Copy, trace: Trace) -> None:
-    assert copy.try_change(change("n -= 1", "__import__('os').abort()"), trace) == ("crash", 6)
+    assert copy.try_change(change("n -= 1", "__import__('os').abort()"), trace) == ("crash", ALL_TESTS)
 
 
 @pytest.mark.release
 def test_remaining_tests_are_run_when_the_first_pass(copy: Copy, trace: Trace, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(copy, "first_tests", 1)
-    assert copy.try_change(change("width * height", "width + height"), trace) == ("caught", 6)
-    assert copy.try_change(TIMES, trace) == ("survived", 6)
+    assert copy.try_change(change("width * height", "width + height"), trace) == ("caught", ALL_TESTS)
+    assert copy.try_change(TIMES, trace) == ("survived", ALL_TESTS)
 
 
 @pytest.mark.release
@@ -296,13 +302,15 @@ def test_process_that_forks_for_tests_has_imported_the_libraries_and_no_module_o
     test = "tests/flat/test_warm.py::test_it"
     warm = WarmTests(copy.root, copy.environment(False), ["colorsys", "no_such_module"])
     allowed_s = 60.0  # of processor time
+    output = tmp_path / "said.txt"
+    run = Run(stages=[[test]], cpu_s=[allowed_s], wall_s=600.0, folder=str(tmp_path / "tests"), said=str(output))
     try:
-        outcome = warm.run(Run([[test]], [allowed_s], 600.0, str(tmp_path / "tests"), str(tmp_path / "said.txt")))
-        assert outcome.status == 0, (tmp_path / "said.txt").read_text()
+        outcome = warm.run(run)
+        assert outcome.status == 0, output.read_text()
         assert 0.0 < outcome.cpu_s < allowed_s
         warm.process.send_signal(signal.SIGKILL)
         with pytest.raises(ChildProcessError, match="has ended"):
-            warm.run(Run([[test]], [allowed_s], 600.0, str(tmp_path / "tests"), str(tmp_path / "said.txt")))
+            warm.run(run)
     finally:
         warm.close()
         (copy.root / "tests" / "flat" / "test_warm.py").unlink()
@@ -409,25 +417,25 @@ def test_strictness_of_a_zip_in_a_loop_is_no_place_to_change() -> None:
 
 def test_changes_of_the_same_seed_are_the_same_and_different_from_each_other() -> None:
     pytest.importorskip("cosmic_ray", reason="it is in the extra mutation")
-    first, second = (choose_changes({"a.py": FUNCTION}, 3, "1") for _ in range(2))
+    first, second = (choose_changes({"a.py": FUNCTION}, count=3, seed="1") for _ in range(2))
     assert first == second
     assert len({change.text for change in first}) == 3
 
 
 def test_changes_of_another_seed_are_others() -> None:
     pytest.importorskip("cosmic_ray", reason="it is in the extra mutation")
-    chosen = [choose_changes({"a.py": FUNCTION}, 3, str(seed)) for seed in range(5)]
+    chosen = [choose_changes({"a.py": FUNCTION}, count=3, seed=str(seed)) for seed in range(5)]
     assert any(changes != chosen[0] for changes in chosen)
 
 
 def test_no_more_changes_are_chosen_than_there_are_places() -> None:
     pytest.importorskip("cosmic_ray", reason="it is in the extra mutation")
-    assert len(choose_changes({"a.py": FUNCTION}, 99, "1")) == 5
+    assert len(choose_changes({"a.py": FUNCTION}, count=99, seed="1")) == 5
 
 
 def chosen_lines(texts: dict[str, str], count: int) -> list[tuple[str, str, str]]:
     """File, line before and line after of the changes that are chosen."""
-    return [(change.file, change.before, change.after) for change in choose_changes(texts, count, "1")]
+    return [(change.file, change.before, change.after) for change in choose_changes(texts, count, seed="1")]
 
 
 EIGHT_FUNCTIONS = "\n\n".join(f"def f{n}(x):\n    y = 2 * x + {n}\n    return y < 1 or y > 5" for n in range(8)) + "\n"
@@ -479,4 +487,4 @@ def test_change_has_its_line_before_and_after() -> None:
 )
 def test_decorators_and_marks_of_keyword_arguments_are_not_changed(text: str) -> None:
     pytest.importorskip("cosmic_ray", reason="it is in the extra mutation")
-    assert choose_changes({"a.py": text}, 9, "1") == []
+    assert choose_changes({"a.py": text}, count=9, seed="1") == []

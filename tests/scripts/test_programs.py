@@ -32,7 +32,7 @@ def test_module_of_slicer_makes_a_surface_in_lps(device: Any, program: str, tmp_
     write_phantom(tmp_path / "ct", PhantomSettings(kind="sphere", size=(32, 32), slices=24))
     mesh_file = str(tmp_path / "bone.ply")
 
-    report = ClreconSurface.make_surface(program, str(tmp_path / "ct"), mesh_file, "hu")
+    report = ClreconSurface.make_surface(program, str(tmp_path / "ct"), mesh_file, surface="hu")
 
     assert report["space"] == "lps"
     assert len(read_mesh(mesh_file).triangles) == report["triangles"]

@@ -29,6 +29,7 @@ def test_recorded_times_name_no_folder_of_this_machine(path: Path) -> None:
 
 
 def tetrahedron(folder: Path, name: str, *, shift: float = 0.0, turned: bool = False, faces: int = 4) -> Path:
+    """A file with a tetrahedron of 20 mm, shifted in mm along each axis, or with its faces turned, or some of them."""
     corners = np.array([(0, 0, 0), (20, 0, 0), (0, 20, 0), (0, 0, 20)], dtype=np.float32) + np.float32(shift)
     triangles = np.array([(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)], dtype=np.uint32)[:faces]
     path = folder / name
@@ -48,13 +49,13 @@ def test_mesh_of_another_program_is_judged_by_its_place_and_the_side_of_its_face
     change: dict[str, Any], closed: bool, in_place: bool, inside_out: bool, tmp_path: Path
 ) -> None:
     own = tetrahedron(tmp_path, "own.stl")
-    judged = whole_processes.judge_mesh(tetrahedron(tmp_path, "other.stl", **change), own, 1.0)
+    judged = whole_processes.judge_mesh(tetrahedron(tmp_path, "other.stl", **change), own, voxel_mm=1.0)
     assert (judged["closed"], judged["in_place"], judged["inside_out"]) == (closed, in_place, inside_out)
 
 
 def test_mesh_of_another_program_that_lacks_a_face_is_judged_as_open(tmp_path: Path) -> None:
     own = tetrahedron(tmp_path, "own.stl")
-    judged = whole_processes.judge_mesh(tetrahedron(tmp_path, "other.stl", faces=3), own, 1.0)
+    judged = whole_processes.judge_mesh(tetrahedron(tmp_path, "other.stl", faces=3), own, voxel_mm=1.0)
     assert (judged["closed"], judged["in_place"]) == (False, True)
 
 
@@ -66,7 +67,7 @@ FAILING = whole_processes.Program("fails", "Fails", (sys.executable, "-c", "rais
 def figures(tmp_path: Path) -> dict[str, Any]:
     """Figures of two programs that make no mesh of a synthetic scan."""
     write_phantom(tmp_path / "ct", PhantomSettings(kind="sphere", size=(24, 24), slices=16))
-    return whole_processes.measure_input("a", tmp_path / "ct", [MISSING, FAILING], 1, tmp_path)
+    return whole_processes.measure_input("a", tmp_path / "ct", [MISSING, FAILING], rounds=1, scratch=tmp_path)
 
 
 @pytest.mark.parametrize(("name", "why"), [("gone", "not here: no-such-program"), ("fails", "exit code 1: no luck")])

@@ -50,10 +50,11 @@ def test_a_label_without_a_canal_is_looked_through_in_fine_pixels_once(monkeypat
 def spans_and_left_out(monkeypatch: pytest.MonkeyPatch) -> tuple[list[Any], list[str]]:
     """Of 90 mm of a canal with discs after 10 and 40 mm: numbers with pieces, and what was left out."""
     monkeypatch.setattr(split, "beside_share", lambda *given: 0.0)
-    depth, bounds = np.zeros((90, 1)), [Bound(10, 8, 90.0), Bound(40, 8, 90.0)]
+    depth, bounds = np.zeros((90, 1)), [Bound(at=place, tilt=8, depth_hu=90.0) for place in (10, 40)]
     looked = split._Found(straight_course(90), depth, looks_of_depth(depth), bounds, np.zeros(90))
     nothing = np.zeros(4)
-    return split._spans(looked, np.zeros((2, 2, 2), np.uint8), nothing, nothing, nothing, 1.0, 200.0)
+    pieces = np.zeros((2, 2, 2), np.uint8)
+    return split._spans(looked, pieces, doubtful=nothing, rim=nothing, arches=nothing, voxel_ml=1.0, level=200.0)
 
 
 def test_a_vertebra_reaches_from_one_disc_to_the_next(spans_and_left_out: tuple[list[Any], list[str]]) -> None:
@@ -78,7 +79,7 @@ def test_a_spinous_process_reaches_below_its_vertebra_by_80_mm_less_1_6_of_its_h
         aside=0.0 * k, ahead=0.0 * k, points=lambda volume, at: np.stack([i[at], j[at], -k[at] - 5.0], axis=-1)
     )
     planes = np.array([(0.0, 0.0, 0.0), (0.0, 0.0, -5.0)]), np.tile((0.0, 0.0, -1.0), (2, 1))
-    bounds_30_mm_apart = [Bound(0, 8, 90.0), Bound(30, 8, 90.0)]
+    bounds_30_mm_apart = [Bound(at=place, tilt=8, depth_hu=90.0) for place in (0, 30)]
     pieces = np.full((60, 1, 1), 2, np.uint8)
     kept = regions._bound(part, pieces, bounds_30_mm_apart, planes, None)  # type: ignore[arg-type]
     below = round(80 - 1.6 * 30)
@@ -93,7 +94,10 @@ def test_the_refinement_begins_with_half_the_steps_of_the_coarse_search() -> Non
 def turned_frame() -> frame.VertebraFrame:
     """About (5, 6, 7), its x along y and its y along -x; the canal at (2, 30) leans by 0.25 and -0.5 mm a mm of z."""
     axes = np.array([(0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)])
-    return frame.VertebraFrame(np.array((5.0, 6.0, 7.0)), axes, (2.0, 30.0), (0.25, -0.5), 9.0, (-20.0, 20.0), 25.0)
+    return frame.VertebraFrame(
+        origin=np.array((5.0, 6.0, 7.0)), axes=axes, canal=(2.0, 30.0), canal_lean=(0.25, -0.5), canal_radius=9.0,
+        body_y=(-20.0, 20.0), body_height=25.0,
+    )  # fmt: skip
 
 
 def test_points_are_turned_and_shifted_into_the_frame_of_a_vertebra_and_back(turned_frame: frame.VertebraFrame) -> None:
@@ -103,7 +107,9 @@ def test_points_are_turned_and_shifted_into_the_frame_of_a_vertebra_and_back(tur
 
 
 def test_the_canal_of_a_frame_leans_with_the_height(turned_frame: frame.VertebraFrame) -> None:
-    assert turned_frame.canal_at(np.array((0.0, 4.0))).tolist() == [[2.0, 30.0, 0.0], [3.0, 28.0, 4.0]]
+    at_the_origin, four_mm_above = turned_frame.canal_at(np.array((0.0, 4.0))).tolist()
+    assert at_the_origin == [2.0, 30.0, 0.0]
+    assert four_mm_above == [2.0 + 4 * 0.25, 30.0 - 4 * 0.5, 4.0]
 
 
 def test_a_wall_beyond_the_reach_of_the_canal_is_not_its_wall() -> None:
@@ -158,7 +164,8 @@ def test_the_bias_of_a_ramp_is_the_way_from_its_half_maximum_to_the_level(ramp_b
 
 def test_the_bias_is_measured_along_rays_all_round_evenly_spaced_stations_of_the_line(ramp_bone: Any) -> None:
     measure_ramp_bias(ramp_bone)
-    points_on_rays = ramp_bone.asked_for[0].reshape(measures.STATIONS, measures.RAYS, -1, 3)
+    points_on_rays, *_ = ramp_bone.asked_for
+    points_on_rays = points_on_rays.reshape(measures.STATIONS, measures.RAYS, -1, 3)
     stations = START + np.linspace(0.0, 10.0, measures.STATIONS)[:, None] * ALONG
     middles = points_on_rays.mean(axis=1)  # of all rays, at each of their steps
     np.testing.assert_allclose(middles, np.broadcast_to(stations[:, None], middles.shape), atol=1e-9)

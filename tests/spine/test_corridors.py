@@ -30,6 +30,7 @@ from clrecon.spine.measures import canal_wall
 
 pytestmark = pytest.mark.untraced
 
+L3 = {"number": 3, "level": HALF_HU, "name": "L3"}  # the label that `BoxVertebra.scan` gives
 POSES = {
     "turned": (BoxVertebra(rotation=turned(18.0, -12.0, 9.0)), {}),
     "straight": (BoxVertebra(), {}),
@@ -47,7 +48,7 @@ def posed(request: pytest.FixtureRequest) -> Any:
     """
     vertebra, options = POSES[request.param]
     affine, shape = grid_around(vertebra, **options)
-    measured = measure_corridors(*vertebra.scan(affine, shape), 3, HALF_HU, "L3")
+    measured = measure_corridors(*vertebra.scan(affine, shape), **L3)
     left, right = measured.corridors
     return SimpleNamespace(
         vertebra=vertebra,
@@ -141,7 +142,7 @@ def test_medial_angles_in_the_patient_differ_by_the_turn_of_the_vertebra() -> No
     """Its left points backwards: a line of the left side runs more to the left, and less towards the midline."""
     vertebra = BoxVertebra(rotation=turned(0.0, 0.0, 15.0))
     affine, shape = grid_around(vertebra)
-    left, right = measure_corridors(*vertebra.scan(affine, shape), 3, HALF_HU, "L3").corridors
+    left, right = measure_corridors(*vertebra.scan(affine, shape), **L3).corridors
     turn_deg = np.degrees(np.arctan2(vertebra.axes[0, 1], vertebra.axes[0, 0]))
     assert left.medial_lps_deg - left.medial_deg == pytest.approx(-turn_deg, abs=tolerances.CORRIDOR_FRAME_DEG)
     assert right.medial_lps_deg - right.medial_deg == pytest.approx(turn_deg, abs=tolerances.CORRIDOR_FRAME_DEG)
@@ -153,9 +154,9 @@ def at_a_tenth_of_the_contrast() -> Any:
 
     Partial volume reaches half a voxel to both sides: a tenth of the contrast lies 0.4 mm outside of the half.
     """
-    vertebra = BoxVertebra()
+    vertebra = BoxVertebra(left_radius=4.0, right_radius=3.0)
     affine, shape = grid_around(vertebra, spacing=(1.0, 1.0, 1.0))
-    return measure_corridors(*vertebra.scan(affine, shape), 3, 100.0, "L3").corridors
+    return measure_corridors(*vertebra.scan(affine, shape), **{**L3, "level": 100.0}).corridors
 
 
 @pytest.mark.release
@@ -175,7 +176,7 @@ def test_the_bias_of_a_lower_level_is_its_way_from_the_half_maximum(at_a_tenth_o
 def test_a_pedicle_less_than_two_voxels_wide_has_no_corridor_and_the_wider_one_has() -> None:
     vertebra = BoxVertebra(left_radius=4.5, right_radius=2.0)
     affine, shape = grid_around(vertebra, spacing=(2.5, 2.5, 2.5))
-    left, right = measure_corridors(*vertebra.scan(affine, shape), 3, HALF_HU, "L3").corridors
+    left, right = measure_corridors(*vertebra.scan(affine, shape), **L3).corridors
     assert left.refused is None
     assert left.radius == pytest.approx(4.5, abs=0.6)  # a quarter of a voxel
     assert right.radius is None
@@ -202,7 +203,7 @@ def test_corridors_of_a_label_that_is_no_vertebra_or_has_no_bone_are_refused(
     without_an_arch: tuple[Volume, np.ndarray], number: int, level_hu: float, name: str, facts: tuple[str | int, ...]
 ) -> None:
     with refused(RefusedInputError, *facts):
-        measure_corridors(*without_an_arch, number, level_hu, name)
+        measure_corridors(*without_an_arch, number=number, level=level_hu, name=name)
 
 
 def test_corridors_of_a_label_too_small_for_a_vertebra_are_refused(without_an_arch: tuple[Volume, np.ndarray]) -> None:
@@ -210,13 +211,13 @@ def test_corridors_of_a_label_too_small_for_a_vertebra_are_refused(without_an_ar
     few = np.zeros_like(labels)
     few[20:30, 40:50, 40:50] = 3
     with refused(RefusedInputError, "volume", "vertebra", "L3"):
-        measure_corridors(volume.with_voxels(np.where(few > 0, 900, 0).astype(np.int16)), few, 3, HALF_HU, "L3")
+        measure_corridors(volume.with_voxels(np.where(few > 0, 900, 0).astype(np.int16)), few, **L3)
 
 
 @pytest.fixture(scope="module")
 def whole_vertebra() -> tuple[Volume, np.ndarray, int, int]:
-    """A scan, its labels, and the first and last row of the vertebra, from front to back."""
-    vertebra = BoxVertebra()
+    """A scan, its labels, and the first and last row of the vertebra, from front to back; its left pedicle has 4 mm."""
+    vertebra = BoxVertebra(left_radius=4.0)
     volume, labels = vertebra.scan(*grid_around(vertebra))
     rows = np.argwhere(labels == 3)[:, 1]
     return volume, labels, int(rows.min()), int(rows.max())
@@ -229,9 +230,10 @@ def test_a_vertebra_whose_plate_the_scan_cuts_has_its_corridors_and_a_warning(
     volume, labels, _, last = whole_vertebra
     through_the_plate = np.s_[:, : last - 3]
     shorter = Volume(volume.voxels[through_the_plate], volume.affine)
-    measured = measure_corridors(shorter, labels[through_the_plate], 3, HALF_HU, "L3")
+    measured = measure_corridors(shorter, labels[through_the_plate], **L3)
+    left, _ = measured.corridors
     assert measured.warnings == ("L3 touches the end of the scan with its processes; body and pedicles are whole",)
-    assert measured.corridors[0].radius == pytest.approx(4.0, abs=tolerances.CORRIDOR_RADIUS_MM)
+    assert left.radius == pytest.approx(4.0, abs=tolerances.CORRIDOR_RADIUS_MM)
 
 
 @pytest.mark.seconds
@@ -243,7 +245,7 @@ def test_corridors_of_a_vertebra_whose_body_the_scan_cuts_are_refused(
     affine = volume.affine.copy()
     affine[:3, 3] += affine[:3, 1] * (first + 4)
     with refused(RefusedInputError, "L3", "voxels"):
-        measure_corridors(Volume(volume.voxels[through_the_body], affine), labels[through_the_body], 3, HALF_HU, "L3")
+        measure_corridors(Volume(volume.voxels[through_the_body], affine), labels[through_the_body], **L3)
 
 
 @pytest.mark.seconds
@@ -278,6 +280,9 @@ def test_distance_of_a_segment_and_of_one_without_length_is_that_of_its_nearest_
     np.testing.assert_allclose(distances, [from_segment, from_place], atol=tolerances.SEGMENT_DISTANCE_MM)
 
 
+SPAN = Span(side=1.0, back=20.0, tip=-20.0, pass_y=0.0)  # lines of the left side, from y = 20 to -20 mm
+
+
 @pytest.fixture
 def judge_and_lines() -> tuple[LineJudge, np.ndarray, np.ndarray, np.ndarray]:
     """A judge of lines in random points with a tunnel of 3 mm, 180 lines, their ends, and the points.
@@ -287,12 +292,11 @@ def judge_and_lines() -> tuple[LineJudge, np.ndarray, np.ndarray, np.ndarray]:
     generator = np.random.default_rng(5)
     surface = generator.uniform(-25.0, 25.0, (3000, 3))
     surface = surface[np.hypot(surface[:, 0], surface[:, 2]) > 3.0]
-    span = Span(1.0, 20.0, -20.0, 0.0)
     known = np.zeros((3, 4))
     known[:, 0] = (-0.5, 0.0, 0.5)
-    judge = LineJudge.beside(known, 5.0, lambda points: points[:, 0], surface, span)
+    judge = LineJudge.beside(known, reach=5.0, depth=lambda points: points[:, 0], surface=surface, span=SPAN)
     lines = np.concatenate([generator.normal(0.0, spread, (60, 4)) for spread in (0.3, 1.0, 8.0)])
-    return judge, lines, line_points(lines, span)[:, [0, -1]].transpose(1, 0, 2), surface
+    return judge, lines, line_points(lines, SPAN)[:, [0, -1]].transpose(1, 0, 2), surface
 
 
 def test_the_radius_of_a_line_is_its_distance_from_all_points_of_the_surface(
@@ -315,9 +319,9 @@ def test_a_judge_keeps_less_than_a_quarter_of_the_surface_which_is_enough_for_li
 
 def test_of_two_lines_as_far_from_the_surface_the_deeper_scores_higher() -> None:
     """Lines at x = -3 and 3 mm beside a surface of one point; the depth is 10 + x mm."""
-    span = Span(1.0, 20.0, -20.0, 0.0)
     lines = np.array([[-3.0, 0.0, 0.0, 0.0], [3.0, 0.0, 0.0, 0.0]])
-    judge = LineJudge.beside(lines, 5.0, lambda points: 10.0 + points[:, 0], np.zeros((1, 3)), span)
+    one_point = np.zeros((1, 3))
+    judge = LineJudge.beside(lines, reach=5.0, depth=lambda points: 10.0 + points[:, 0], surface=one_point, span=SPAN)
     np.testing.assert_allclose(judge.radius(lines), [3.0, 3.0], atol=tolerances.SEGMENT_DISTANCE_MM)
     shallow, deep = judge.score(lines)
     assert 3.0 < shallow < deep < 3.5  # the radius counts most
@@ -338,7 +342,7 @@ def test_corridors_of_a_label_by_name_are_those_of_its_number(
 ) -> None:
     volume, labels, _, _ = whole_vertebra
     by_name = find_corridors(volume, LabelMap(labels, volume.affine, {3: "L3"}), "L3", HALF_HU)
-    by_number = measure_corridors(volume, labels, 3, HALF_HU, "L3")
+    by_number = measure_corridors(volume, labels, **L3)
     assert by_name.name == "L3"
     assert [side.radius for side in by_name.corridors] == [side.radius for side in by_number.corridors]
 
@@ -390,7 +394,8 @@ def test_the_nearest_wall_lies_beside_the_line_or_beyond_its_ends(
     surface = np.array([(5.0, 3.0, 0.0), (-4.0, 0.0, 0.0), (14.0, 3.0, 0.0), (5.0, 0.0, 40.0)])[left_out:]
     by_hu = np.array((True, False, False, True))[left_out:]
     bone, frame = SimpleNamespace(steps=np.diag((0.5, 1.5, 2.0)), by_hu=by_hu), SimpleNamespace(axes=np.eye(3))
-    measured = _walls(bone, frame, surface, np.zeros(3), np.array((10.0, 0.0, 0.0)), radius)  # type: ignore[arg-type]
-    assert measured[0] == pytest.approx(distance_mm)
+    first, last = np.zeros(3), np.array((10.0, 0.0, 0.0))
+    nearest_mm, *diameter_and_share = _walls(bone, frame, surface, first, last, radius)  # type: ignore[arg-type]
+    assert nearest_mm == pytest.approx(distance_mm)
     if in_voxels is not None:
-        assert measured[1:] == pytest.approx((in_voxels, by_hu_share))
+        assert diameter_and_share == pytest.approx([in_voxels, by_hu_share])

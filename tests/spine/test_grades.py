@@ -20,9 +20,10 @@ OFFSETS = {"medial": (-1.0, 0.0), "lateral": (1.0, 0.0), "cranial": (0.0, 1.0), 
 
 @pytest.fixture(scope="module")
 def bone_and_frame() -> tuple[SolidBone, VertebraFrame]:
+    """The solid bone of `VERTEBRA`, and the frame that is found in it."""
     affine, shape = grid_around(VERTEBRA)
     volume, labels = VERTEBRA.scan(affine, shape)
-    bone = fill_vertebra(volume, labels, 3, HALF_HU, "L3")
+    bone = fill_vertebra(volume, labels, number=3, level=HALF_HU, subject="L3")
     return bone, find_frame(bone, "L3")
 
 
@@ -30,8 +31,8 @@ def place_screw(side: float, outward: float, up: float, diameter: float, front: 
     """A screw along a pedicle's axis, shifted outward and up, from behind the plate to y = `front`; lengths in mm."""
     start, _ = VERTEBRA.axis(side)
     x, z = start[0] + side * outward, start[2] + up
-    ends = np.array([(x, 48.0, z), (x, front, z)]) @ VERTEBRA.axes + np.array(VERTEBRA.centre)
-    return Screw(ends[0], ends[1], diameter)
+    entry, tip = np.array([(x, 48.0, z), (x, front, z)]) @ VERTEBRA.axes + np.array(VERTEBRA.centre)
+    return Screw(entry=entry, tip=tip, diameter=diameter)
 
 
 BREACH_MM = 0.25
@@ -69,14 +70,16 @@ def test_the_breach_of_a_screw_is_what_lies_outside_of_the_pedicle(
 @on_each_side
 @pytest.mark.parametrize("direction", ["medial"])
 def test_a_screw_has_the_side_of_its_pedicle(breaching: tuple[ScrewGrade, float], side: float) -> None:
-    assert breaching[0].side == ("left" if side > 0.0 else "right")
+    grade, _ = breaching
+    assert grade.side == ("left" if side > 0.0 else "right")
 
 
 @pytest.mark.seconds
 @on_each_side
 @pytest.mark.parametrize("direction", ["medial", "cranial", "caudal"])
 def test_a_screw_whose_tip_lies_in_the_body_does_not_stand_out_in_front(breaching: tuple[ScrewGrade, float]) -> None:
-    assert breaching[0].front_mm == 0.0
+    grade, _ = breaching
+    assert grade.front_mm == 0.0
 
 
 def test_a_screw_in_the_middle_of_a_pedicle_has_grade_a_without_a_breach(
@@ -120,7 +123,7 @@ def test_a_screw_that_runs_from_front_to_back_is_refused_at_any_height(
 ) -> None:
     shift = np.array((0.0, 0.0, up_mm))
     with refused(UsageError, "screw", "front", "back", "L3"):
-        grade_screw(*bone_and_frame, Screw(SCREW.tip + shift, SCREW.entry + shift, 5.0), "L3")
+        grade_screw(*bone_and_frame, Screw(entry=SCREW.tip + shift, tip=SCREW.entry + shift, diameter=5.0), "L3")
 
 
 @pytest.mark.parametrize("shift", [(0, 0, -200.0), (0, 0, 200.0), (300.0, 300.0, 300.0)], ids=["below", "above", "far"])
@@ -128,7 +131,7 @@ def test_a_screw_beside_the_vertebra_is_refused_with_its_distance(
     bone_and_frame: tuple[SolidBone, VertebraFrame], shift: tuple[float, ...]
 ) -> None:
     with refused(UsageError, "screw", "mm", "from", "L3"):
-        grade_screw(*bone_and_frame, Screw(SCREW.entry + shift, SCREW.tip + shift, 5.0), "L3")
+        grade_screw(*bone_and_frame, Screw(entry=SCREW.entry + shift, tip=SCREW.tip + shift, diameter=5.0), "L3")
 
 
 def test_a_screw_whose_tip_lies_behind_the_body_is_refused(bone_and_frame: tuple[SolidBone, VertebraFrame]) -> None:
@@ -153,7 +156,7 @@ def test_a_screw_without_length_or_of_an_impossible_thickness_is_refused(
     entry: np.ndarray, diameter: float, words: str
 ) -> None:
     with pytest.raises(UsageError, match=words):
-        Screw(np.array(entry), SCREW.tip, diameter)
+        Screw(entry=np.array(entry), tip=SCREW.tip, diameter=diameter)
 
 
 def test_the_axis_and_hole_of_a_tube_are_found_between_the_directions_that_are_tried_first() -> None:
