@@ -14,7 +14,10 @@ from clrecon.spine.discs import AHEAD_MM, ASIDE_MM, Bound, Course, Looks
 from clrecon.spine.regions import CONFIDENT, WEIGHTS, Piece, Traits, _walls, beside_share, judge, weigh
 
 PLACES = 60
-WHOLE = Piece(Bound(10, 0, 40.0), Bound(50, 0, 20.0), 10, 50, 2.4, 0.775, 0.375, 0.75, 0.0276)
+WHOLE = Piece(
+    upper=Bound(at=10, tilt=0, depth_hu=40.0), lower=Bound(at=50, tilt=0, depth_hu=20.0), begin=10, end=50,
+    volume_ml=2.4, largest_share=0.775, doubtful_share=0.375, rim_share=0.75, arch_ml=0.0276,
+)  # fmt: skip
 """Most of its traits lie half way between bad and good."""
 
 
@@ -42,19 +45,21 @@ def scan_along_the_canal() -> np.ndarray:
     return scan
 
 
-def judge_piece(
-    piece: Piece, gaps: tuple[float, ...] = (), depths: dict[int, float] | None = None, scan: np.ndarray | None = None
-) -> Traits:
+def judge_piece(piece: Piece, gaps: tuple[float, ...], depths: dict[int, float] | None) -> Traits:
+    """Judge a piece in the scan above; discs are usually 100 HU dark, and 50 HU at its lower end."""
     nothing = np.zeros((PLACES, 3))
     known = np.zeros(PLACES, bool)
     known[10:35] = known[50:] = True  # 25 of 40
-    course = Course(nothing, nothing, nothing, nothing, known, (False, False))
+    course = Course(canal=nothing, down=nothing, ahead=nothing, aside=nothing, known=known, reaches=(False, False))
     usual = np.full(PLACES, 100.0)
     usual[50:] = 50.0
-    return judge(piece, gaps, scan_along_the_canal() if scan is None else scan, bodies_as_seen(depths), course, usual)
+    return judge(piece, gaps, scan_along_the_canal(), bodies_as_seen(depths), course, usual)
 
 
-def traits_of(piece: Piece, gaps: tuple[float, ...] = (), depths: dict[int, float] | None = None) -> dict[str, float]:
+def traits_of(
+    piece: Piece, *, gaps: tuple[float, ...] = (), depths: dict[int, float] | None = None
+) -> dict[str, float]:
+    """The traits of a piece from 0 to 1, by the heights of its neighbours and the darkness of planes at places."""
     return {name: value for name, (value, _) in judge_piece(piece, gaps, depths).items()}
 
 
@@ -81,7 +86,7 @@ TRAITS_OF_WHOLE = {
 
 @pytest.mark.parametrize("trait", TRAITS_OF_WHOLE)
 def test_a_whole_vertebra_has_each_trait_as_far_as_its_figure_lies_between_bad_and_good(trait: str) -> None:
-    traits = traits_of(WHOLE, USUAL_GAPS_MM, {20: 36.0})
+    traits = traits_of(WHOLE, gaps=USUAL_GAPS_MM, depths={20: 36.0})
     assert traits.keys() == TRAITS_OF_WHOLE.keys()
     assert traits[trait] == pytest.approx(TRAITS_OF_WHOLE[trait], rel=tolerances.FLOAT32_SHARE)
 
@@ -89,12 +94,12 @@ def test_a_whole_vertebra_has_each_trait_as_far_as_its_figure_lies_between_bad_a
 @pytest.mark.parametrize(
     ("changes", "gaps", "trait", "value"),
     [
-        ({}, (56.0,), "height", 4 / 7),
+        ({}, (56.0,), "height", (1.6 - 56 / 40) / (1.6 - 1.25)),
         ({}, (40.0, 48.0), "height", 1.0),
-        ({"volume_ml": 90.0}, (), "volume", 0.5),
-        ({"volume_ml": 0.8, "upper": None}, (), "volume", 0.5),
-        ({"volume_ml": 90.0, "lower": None}, (), "volume", 0.5),
-        ({"upper": Bound(10, 0, 80.0), "lower": Bound(50, 0, 90.0)}, (), "inside", 1.0),
+        ({"volume_ml": 90.0}, (), "volume", (100 - 90) / (100 - 80)),
+        ({"volume_ml": 0.8, "upper": None}, (), "volume", (0.8 - 0.6) / (1.0 - 0.6)),
+        ({"volume_ml": 90.0, "lower": None}, (), "volume", (100 - 90) / (100 - 80)),
+        ({"upper": Bound(10, 0, depth_hu=80.0), "lower": Bound(50, 0, depth_hu=90.0)}, (), "inside", 1.0),
     ],
     ids=[
         "lower than usual by 28 %",
@@ -109,13 +114,13 @@ def test_height_volume_and_inside_of_a_vertebra_follow_neighbours_ends_and_discs
     changes: dict[str, Any], gaps: tuple[float, ...], trait: str, value: float
 ) -> None:
     """The plane within it is 36 HU darker than bone, of 50 HU by its discs, or 80 HU."""
-    traits = traits_of(replace(WHOLE, **changes), gaps, {20: 36.0})
+    traits = traits_of(replace(WHOLE, **changes), gaps=gaps, depths={20: 36.0})
     assert traits[trait] == pytest.approx(value, rel=tolerances.FLOAT32_SHARE)
 
 
 def test_each_trait_of_a_vertebra_is_described_with_its_figure() -> None:
     """The figures stand beside `TRAITS_OF_WHOLE`."""
-    assert [text for _, text in judge_piece(WHOLE, USUAL_GAPS_MM, {20: 36.0}).values()] == [
+    assert [text for _, text in judge_piece(WHOLE, gaps=USUAL_GAPS_MM, depths={20: 36.0}).values()] == [
         "the disc at its upper end is 40 HU darker than bone",
         "the disc at its lower end is 20 HU darker than bone",
         "36 HU darker plane within it: there may be another disc",
@@ -156,19 +161,19 @@ def test_a_wall_has_130_hu_and_is_60_hu_denser_than_what_lies_beyond(wall: float
 @WALLS
 def test_a_wall_in_front_alone_lies_in_12_of_18_directions(wall: float, beyond: float, share: float) -> None:
     page = ring(wall, beyond)
-    page[:20] = 70.0  # behind the middle
+    page[:20] = 70.0  # behind the middle; directions lie between -130 and 130 degrees from the front
     walls = _walls(np.repeat(page[None], PLACES, axis=0), BODY_OF_40_MM, WHOLE)
     assert walls == pytest.approx(share * 12 / 18)
 
 
 def test_a_part_of_a_vertebra_without_a_lower_end_is_not_judged_by_lower_disc_height_and_arch() -> None:
     usual_height_mm = (28.0,)
-    whole, part = traits_of(WHOLE, usual_height_mm), traits_of(replace(WHOLE, lower=None), usual_height_mm)
+    whole, part = traits_of(WHOLE, gaps=usual_height_mm), traits_of(replace(WHOLE, lower=None), gaps=usual_height_mm)
     assert set(whole) - set(part) == {"lower disc", "height", "arch"}
 
 
 def test_a_vertebra_without_neighbours_is_not_judged_by_its_height() -> None:
-    assert "height" not in traits_of(WHOLE, ())
+    assert "height" not in traits_of(WHOLE, gaps=())
 
 
 @pytest.mark.parametrize(
@@ -187,7 +192,7 @@ def test_another_disc_is_looked_for_a_quarter_of_the_height_and_at_least_7_mm_fr
 ) -> None:
     """Places are 1 mm apart, and the vertebra begins at 10; planes nearer to its ends are darker by 999 HU."""
     traits = traits_of(replace(WHOLE, end=end), depths=depths)
-    expected = min(1.0, 2.0 * (1.0 - darkest / 50.0))
+    expected = min(1.0, 2.0 * (1.0 - darkest / 50.0))  # as in `TRAITS_OF_WHOLE`
     assert traits["inside"] == pytest.approx(expected, rel=tolerances.FLOAT32_SHARE)
 
 
@@ -252,7 +257,7 @@ def bone_beside_the_lower() -> tuple[np.ndarray, Looks]:
 
 
 def test_bone_everywhere_beside_a_body_has_a_share_of_1(bone_beside_the_lower: tuple[np.ndarray, Looks]) -> None:
-    assert beside_share(*bone_beside_the_lower, LOWER, 100.0) == 1.0
+    assert beside_share(*bone_beside_the_lower, LOWER, level=100.0) == 1.0
 
 
 def test_one_of_15_rows_without_bone_beside_a_body_is_missing_in_its_share(
@@ -260,7 +265,7 @@ def test_one_of_15_rows_without_bone_beside_a_body_is_missing_in_its_share(
 ) -> None:
     scan, looks = bone_beside_the_lower
     scan[MIDDLE_OF_THE_LOWER, 6] = 0.0
-    assert beside_share(scan, looks, LOWER, 100.0) == pytest.approx(14 / 15)
+    assert beside_share(scan, looks, LOWER, level=100.0) == pytest.approx(14 / 15)
 
 
 def test_two_of_10_places_below_the_level_beside_a_body_are_missing_in_its_share(
@@ -268,12 +273,12 @@ def test_two_of_10_places_below_the_level_beside_a_body_are_missing_in_its_share
 ) -> None:
     scan, looks = bone_beside_the_lower
     scan[34:36] -= 1.0
-    assert beside_share(scan, looks, LOWER, 100.0) == pytest.approx(0.8)
+    assert beside_share(scan, looks, LOWER, level=100.0) == pytest.approx(0.8)
 
 
 def test_nothing_above_the_level_or_nothing_known_beside_a_body_has_a_share_of_0(
     bone_beside_the_lower: tuple[np.ndarray, Looks],
 ) -> None:
     scan, looks = bone_beside_the_lower
-    assert beside_share(scan, looks, LOWER, 101.0) == 0.0
-    assert beside_share(np.full_like(scan, np.nan), looks, LOWER, 100.0) == 0.0
+    assert beside_share(scan, looks, LOWER, level=101.0) == 0.0
+    assert beside_share(np.full_like(scan, np.nan), looks, LOWER, level=100.0) == 0.0

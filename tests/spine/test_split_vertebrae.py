@@ -23,6 +23,7 @@ from clrecon.spine.split import _describe_refusal
 
 COARSE: dict[str, Any] = {"size": (112, 112), "spacing": (2.0, 2.0, 2.5)}
 LEAST_RIGHT = 0.95
+"""Share of a vertebra's true voxels that have its number; measured 0.962 and more: some err where facets touch."""
 
 
 @cache
@@ -105,7 +106,7 @@ def true_centres() -> np.ndarray:
 def test_each_disc_of_four_vertebrae_lies_half_way_between_two_true_centres(true_centres: np.ndarray) -> None:
     half_way = 0.5 * (true_centres[1:] + true_centres[:-1])
     heights = split("T12-L3").discs_mm[:, 2]
-    assert heights == pytest.approx(half_way[:, 2], abs=4.0)  # slices of 2.5 mm
+    assert heights == pytest.approx(half_way[:, 2], abs=1.5)  # mm, in slices of 2.5 mm; measured 0.64
 
 
 def test_normals_of_discs_have_length_1_and_point_down() -> None:
@@ -116,7 +117,9 @@ def test_normals_of_discs_have_length_1_and_point_down() -> None:
 
 def test_centres_of_vertebrae_lie_at_the_height_of_the_true_ones(true_centres: np.ndarray) -> None:
     heights = [vertebra.centre_mm[2] for vertebra in split("T12-L3").vertebrae]
-    assert heights == pytest.approx(true_centres[:, 2], abs=6.0)  # of all bone, of which arches hang lower
+    assert heights == pytest.approx(
+        true_centres[:, 2], abs=5.0
+    )  # mm, of all bone, of which arches hang lower; measured 2.7
 
 
 NAMES_BY_NUMBER = {19: "T12", 20: "L1", 21: "L2", 22: "L3"}
@@ -225,7 +228,7 @@ def no_canal_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_seeds_need_no_canal() -> None:
     matches = split_by_seeds()
     assert numbers_of(matches) == [1, 2, 3, 4]
-    assert least_share(matches) >= 0.9, matches  # a straight line through the seeds stands for the canal
+    assert least_share(matches) >= LEAST_RIGHT, matches  # a straight line through the seeds stands for the canal
 
 
 @pytest.mark.usefixtures("no_canal_is_found")
@@ -291,7 +294,7 @@ def test_two_vertebrae_whose_disc_is_missed_are_one_of_low_confidence_and_unusua
     with_unsure, _ = third_disc_missed
     (unsure,) = (vertebra for vertebra in with_unsure.vertebrae if not vertebra.is_confident)
     assert unsure.confidence < CONFIDENT
-    assert unsure.height_mm > 22.0  # a vertebra of the neck and its disc have 17
+    assert unsure.height_mm > 22.0  # measured 25: a vertebra of the neck and its disc have 17
     assert any("usual beside it" in doubt for doubt in unsure.doubts)
     _, truth, _ = phantom("C3-T2")
     voxels_of_levels = np.bincount(truth[with_unsure.labels.voxels == unsure.number], minlength=8)[1:]
@@ -313,7 +316,7 @@ LONG_SPINES = {
     "chest with ribs": ("T1-T12", {"size": (150, 150), "spacing": (2.4, 2.4, 2.4)}, 0.7),
     "whole spine": ("C1-L5", {"size": (150, 150), "spacing": (2.4, 2.4, 2.5)}, 0.65),
 }
-"""Levels, settings, and the least overlap (Dice) of a vertebra with the truth, in coarse voxels."""
+"""Levels, settings, and the least overlap (Dice) of a vertebra with the truth; measured 0.02 to 0.08 more."""
 
 
 @pytest.fixture(scope="module", params=daily(1, LONG_SPINES))
@@ -355,7 +358,7 @@ def test_each_vertebra_of_a_long_spine_overlaps_the_true_one(long_spine: SimpleN
 
 @pytest.mark.seconds
 def test_confidence_is_near_the_overlap_with_the_truth(long_spine: SimpleNamespace) -> None:
-    """Measured in the neck: 0.03 on average, 0.05 at most."""
+    """Measured: 0.025 to 0.053 on average, 0.048 to 0.102 at most."""
     off = np.abs(long_spine.confidence - long_spine.dice)
     assert off.mean() <= 0.08
     assert off.max() <= 0.2
@@ -378,7 +381,7 @@ def test_a_single_vertebra_between_its_two_discs_is_found() -> None:
     volume, truth, names = phantom("L3")
     matches = match_levels(clrecon.split_vertebrae(volume).labels.voxels, truth, names)
     _, share = matches["L3"]
-    assert share > 0.7  # its processes reach beyond the discs, where nothing tells whose they are
+    assert share > 0.7  # measured 0.76: its processes reach beyond the discs, where nothing tells whose they are
 
 
 @pytest.mark.parametrize(
@@ -441,9 +444,10 @@ def part_with_nan() -> tuple[Any, tuple[int, ...]]:
     volume = Volume(hu, np.diag((2.0, 2.0, 1.0, 1.0)))
     down, ahead, aside = (np.tile(axis, (10, 1)) for axis in ((0.0, 0.0, -1.0), (0.0, -1.0, 0.0), (1.0, 0.0, 0.0)))
     canal = np.column_stack([np.full(10, 60.0), np.full(10, 80.0), np.arange(10.0, 0.0, -1.0)])
-    course = Course(canal, down, ahead, aside, np.ones(10, bool), (False, False))
+    course = Course(canal, down, ahead, aside, known=np.ones(10, bool), reaches=(False, False))
     nothing, mm = np.zeros((10, 1), np.float32), np.full(10, 20.0)
-    part = cut_part(volume, course, Looks(nothing, nothing, nothing, mm, mm, mm))
+    looks = Looks(brightness=nothing, core=nothing, depth=nothing, middle_mm=mm, front_mm=mm, side_mm=mm)
+    part = cut_part(volume, course, looks)
     return part, tuple(np.array((5, 30, 20)) - part.first)
 
 
