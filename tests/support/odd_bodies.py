@@ -33,7 +33,10 @@ BODIES: dict[str, dict[str, Any]] = {
     "water": {"kind": "water", "table": "flat"},
     "empty": {"kind": "empty", "table": "flat"},
 }
-"""Settings of each body; those without a gap touch the table."""
+"""Settings of each body; those without a gap touch the table.
+
+Contrast medium has up to 461 HU, bone of a trunk or a pelvis up to 841, but for what metal of 3071 HU blurs into.
+"""
 
 
 @dataclass(frozen=True)
