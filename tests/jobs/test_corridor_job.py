@@ -46,6 +46,7 @@ SETTINGS = PhantomSettings(levels="L1-L2", size=(150, 150), spacing=(0.9, 0.9, 1
 
 @pytest.fixture(scope="module")
 def ct(shared_folder: Path) -> Path:
+    """The folder of a CT of L1 and L2 with their labels, levels.nrrd."""
     return make_once(shared_folder, "phantom-of-corridors", lambda folder: write_phantom(folder, SETTINGS))
 
 
@@ -61,12 +62,12 @@ class FittedVertebra:
 
 @pytest.fixture(scope="module")
 def fitted_vertebra(device: Any) -> FittedVertebra:
-    vertebra = BoxVertebra()
+    vertebra, number, level_hu = BoxVertebra(), 3, 150.0
     affine, shape = grid_around(vertebra, spacing=(1.0, 1.0, 1.0))
     volume, labels = vertebra.scan(affine, shape)
     with DeviceVolume(volume, device=device) as resident:
-        mesh = fit_labels(resident, LabelMap(labels, affine), 150.0, 3)[3]
-    bone = fill_vertebra(volume, labels, 3, 150.0, "L3", partial(lay_on_lattice, mesh))
+        mesh = fit_labels(resident, LabelMap(labels, affine), level_hu, number)[number]
+    bone = fill_vertebra(volume, labels, number, level_hu, subject="L3", fitted=partial(lay_on_lattice, mesh))
     places = np.random.default_rng(1).integers(0, bone.solid.shape, (20_000, 3))
     return FittedVertebra(vertebra, bone, places, vertebra.depth(bone.lattice.points(places)))
 
@@ -130,18 +131,18 @@ def load(path: Path) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def plain(ct: Path, shared_folder: Path) -> Path:
+def l1_at_226_hu(ct: Path, shared_folder: Path) -> Path:
     """A folder with the report on L1 at 226 HU, and what was said."""
     options = ("--labels", ct / "levels.nrrd", "--label", "L1", "--hu", "226")
-    return make_once(shared_folder, "corridors-plain", lambda folder: run_in(folder, ct, *options))
+    return make_once(shared_folder, "corridors-l1_at_226_hu", lambda folder: run_in(folder, ct, *options))
 
 
 @pytest.fixture(scope="module")
-def whole(ct: Path, plain: Path, shared_folder: Path) -> Path:
-    """The same at the bone's own level in RAS, with meshes, a picture, and two screws along the plain corridors."""
+def l1_with_screws(ct: Path, l1_at_226_hu: Path, shared_folder: Path) -> Path:
+    """The same at the bone's own level in RAS, with meshes, a picture, and two screws along those corridors."""
 
     def make(folder: Path) -> None:
-        left, right = load(plain / "report.json")["vertebrae"][0]["corridors"]
+        left, right = load(l1_at_226_hu / "report.json")["vertebrae"][0]["corridors"]
         entry, tip = ([*(-x for x in left[name][:2]), left[name][2]] for name in ("entry_mm", "tip_mm"))
         given = ",".join(map(str, (*entry, *tip, round(2.0 * true_radius_mm(left) + 1.5, 2))))
         ends = {name: [*(-x for x in right[f"{name}_mm"][:2]), right[f"{name}_mm"][2]] for name in ("entry", "tip")}
@@ -172,7 +173,8 @@ def run_in(folder: Path, *arguments: object) -> None:
 
 
 @pytest.fixture(
-    scope="module", params=daily(1, [("whole", tolerances.CORRIDOR_HALF_MM), ("plain", tolerances.CORRIDOR_226_MM)])
+    scope="module",
+    params=daily(1, [("l1_with_screws", tolerances.CORRIDOR_HALF_MM), ("l1_at_226_hu", tolerances.CORRIDOR_226_MM)]),
 )
 def reported(request: pytest.FixtureRequest, device: Any) -> Any:
     """Report and words of a run, the signs from its frame to LPS, and how far its radius may be off."""
@@ -184,7 +186,7 @@ def reported(request: pytest.FixtureRequest, device: Any) -> Any:
         bar=bar,
         report=report,
         said=(folder / "said.txt").read_text(),
-        to_lps=np.array([-1.0, -1.0, 1.0]) if name == "whole" else np.ones(3),
+        to_lps=np.array([-1.0, -1.0, 1.0]) if name == "l1_with_screws" else np.ones(3),
         sides=report["vertebrae"][0]["corridors"],
     )
 
@@ -243,18 +245,18 @@ def test_words_and_report_name_what_a_corridor_does_not_determine_and_the_bias_a
 
 
 @pytest.mark.slow
-def test_scale_of_grades_is_reported_where_screws_are_given(whole: Path) -> None:
-    assert load(whole / "report.json")["grade_scale"] is not None
+def test_scale_of_grades_is_reported_where_screws_are_given(l1_with_screws: Path) -> None:
+    assert load(l1_with_screws / "report.json")["grade_scale"] is not None
 
 
 @pytest.mark.slow
-def test_scale_of_grades_is_not_reported_without_screws(plain: Path) -> None:
-    assert load(plain / "report.json")["grade_scale"] is None
+def test_scale_of_grades_is_not_reported_without_screws(l1_at_226_hu: Path) -> None:
+    assert load(l1_at_226_hu / "report.json")["grade_scale"] is None
 
 
 @pytest.mark.slow
-def test_screw_wider_than_its_corridor_by_one_and_a_half_mm_is_graded_b_with_its_breach(whole: Path) -> None:
-    wide, _ = load(whole / "report.json")["vertebrae"][0]["screws"]
+def test_screw_wider_than_its_corridor_by_one_and_a_half_mm_is_graded_b_with_its_breach(l1_with_screws: Path) -> None:
+    wide, _ = load(l1_with_screws / "report.json")["vertebrae"][0]["screws"]
 
     assert wide["grade"] == "B"
     on_each_side_mm = 1.5 / 2
@@ -263,31 +265,33 @@ def test_screw_wider_than_its_corridor_by_one_and_a_half_mm_is_graded_b_with_its
 
 
 @pytest.mark.slow
-def test_screw_within_the_right_corridor_is_graded_a_at_its_given_entry(plain: Path, whole: Path) -> None:
-    _, inner = load(whole / "report.json")["vertebrae"][0]["screws"]
+def test_screw_within_the_right_corridor_is_graded_a_at_its_given_entry(
+    l1_at_226_hu: Path, l1_with_screws: Path
+) -> None:
+    _, inner = load(l1_with_screws / "report.json")["vertebrae"][0]["screws"]
 
     assert (inner["name"], inner["grade"], inner["side"]) == ("inner", "A", "right")
-    right = load(plain / "report.json")["vertebrae"][0]["corridors"][1]
+    _, right = load(l1_at_226_hu / "report.json")["vertebrae"][0]["corridors"]
     entry_lps = np.multiply(inner["entry_mm"], (-1, -1, 1))  # from RAS
     np.testing.assert_allclose(entry_lps, right["entry_mm"], atol=2e-3)  # reports have 3 decimals
 
 
 @pytest.mark.slow
-def test_grades_of_screws_are_printed_with_their_scale(whole: Path) -> None:
-    said = (whole / "said.txt").read_text()
+def test_grades_of_screws_are_printed_with_their_scale(l1_with_screws: Path) -> None:
+    said = (l1_with_screws / "said.txt").read_text()
     assert "grade B" in said
     assert "grade A, no breach" in said
     assert "Gertzbein-Robbins in five grades" in said
 
 
 @pytest.mark.slow
-def test_vertebra_corridors_and_screws_are_written_as_one_mesh_each(whole: Path) -> None:
+def test_vertebra_corridors_and_screws_are_written_as_one_mesh_each(l1_with_screws: Path) -> None:
     names = ["L1", "L1_left", "L1_right", "L1_screw_1", "L1_screw_2"]
 
-    outputs = load(whole / "report.json")["outputs"]
+    outputs = load(l1_with_screws / "report.json")["outputs"]
 
     assert [output["name"] for output in outputs if output["kind"] == "mesh"] == names
-    written = {path.name for path in whole.iterdir()}
+    written = {path.name for path in l1_with_screws.iterdir()}
     assert written == {*(f"l1_{name}.ply" for name in names), "l1.png", "report.json", "said.txt"}
 
 
@@ -306,14 +310,17 @@ def test_an_older_mesh_of_a_corridor_is_refused_with_no_clobber(ct: Path, tmp_pa
 def test_screw_across_its_corridor_is_drawn_in_the_section_that_it_meets(above_mm: float, fall_mm: float) -> None:
     """The plane square to the corridor cuts a screw of radius 2 mm in a circle or two lines, or misses it."""
     volume = Volume(np.zeros((100, 100, 100), np.int16), np.eye(4))
-    frame = VertebraFrame(np.full(3, 50.0), np.eye(3), (0.0, 20.0), (0.0, 0.0), 9.0, (-15.0, 15.0), 25.0)
-    none = Corridor("left", "no room")
+    frame = VertebraFrame(
+        origin=np.full(3, 50.0), axes=np.eye(3), canal=(0.0, 20.0), canal_lean=(0.0, 0.0), canal_radius=9.0,
+        body_y=(-15.0, 15.0), body_height=25.0,
+    )  # fmt: skip
+    none = Corridor("left", refused="no room")
     found: Any = SimpleNamespace(name="L2", frame=frame, corridors=(none,))
     section_y, radius_mm = 65.0, 2.0
     entry = np.array((56.0, section_y + above_mm, 50.0))
-    screw = Screw(entry, entry + (20.0, -fall_mm, 0.0), 2 * radius_mm, "given")
+    screw = Screw(entry, tip=entry + (20.0, -fall_mm, 0.0), diameter=2 * radius_mm)
 
-    pixels = draw_corridors(volume, found, [screw], 1.0, []).image.astype(int)
+    pixels = draw_corridors(volume, found, [screw], margin=1.0, footer=[]).image.astype(int)
 
     is_screw = np.asarray((np.abs(pixels[..., :3] - GIVEN) <= 40).all(axis=2))  # of 255: smoothed edges
     third = pixels.shape[1] // 3

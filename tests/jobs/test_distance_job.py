@@ -160,7 +160,10 @@ def test_meshes_of_different_frames_of_reference_are_warned_of(two_of_one_shape:
 
 
 def test_mesh_has_no_distance_from_itself_and_no_warning(two_of_one_shape: tuple[str, str]) -> None:
-    report = report_distances(two_of_one_shape[0], two_of_one_shape[0])
+    path, _ = two_of_one_shape
+
+    report = report_distances(path, path)
+
     assert report["hausdorff_mm"] == pytest.approx(0.0, abs=1e-6)  # points on triangles in float64
     assert report["warnings"] == []
 
@@ -171,8 +174,8 @@ def test_written_mesh_has_its_vertices_in_ras_and_the_distance_at_each(files: di
 
     report = report_distances(files["a.stl"], files["b.ply"], "-o", str(out), "--space", "ras")
 
-    assert report["outputs"][0]["name"] == "out.ply"
-    assert report["outputs"][0]["bytes"] == out.stat().st_size
+    (output,) = report["outputs"]
+    assert (output["name"], output["bytes"]) == ("out.ply", out.stat().st_size)
     a, b = clrecon.read_mesh(files["a.stl"]), clrecon.read_mesh(files["b.ply"])
     assert clrecon.read_mesh(out).triangle_count == a.triangle_count
     written = trimesh.load(out, process=False)

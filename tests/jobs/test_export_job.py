@@ -28,9 +28,12 @@ pytestmark = pytest.mark.first_device
 NAME = "Geheimnis^Jolanthe"
 
 
+SHAPE_KJI = (12, 20, 24)
+
+
 def write_ct(folder: Path, **plan: object) -> Path:
-    """Write a CT of 24 x 20 x 12 voxels with the name of a patient into `folder`; return where it is."""
-    plan = {"shape": (12, 20, 24), "gap": 1.25, **plan}
+    """Write a CT of SHAPE_KJI with the name of a patient into `folder`; return where it is."""
+    plan = {"shape": SHAPE_KJI, "gap": 1.25, **plan}
     dicom_series.write_series(folder / "ct", dicom_series.Plan(**plan), lambda ds, k: setattr(ds, "PatientName", NAME))
     return folder / "ct"
 
@@ -198,7 +201,7 @@ def test_existing_file_of_an_export_is_replaced_without_no_clobber(tmp_path: Pat
 
     assert run("export", write_ct(tmp_path), "-o", tmp_path / "a.nii") == 0
 
-    assert read_volume(tmp_path / "a.nii").voxels.shape == (12, 20, 24)
+    assert read_volume(tmp_path / "a.nii").voxels.shape == SHAPE_KJI
 
 
 def test_export_from_python_resamples_and_reports_its_stages_and_affine(tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ PARTS = ("dense", "trabecular", "canal", "solid")
 
 @pytest.fixture(scope="module")
 def spine(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a CT of L1 and L2 in voxels of 1 x 1 x 1.5 mm, with their true labels, levels.nrrd."""
     folder = tmp_path_factory.mktemp("inside") / "spine"
     write_phantom(folder, PhantomSettings(levels="L1-L2", size=(140, 140), spacing=(1.0, 1.0, 1.5)))
     return folder
@@ -144,7 +145,7 @@ def test_report_and_words_name_the_surface_fitted_to_the_solid_bone(run_inside: 
     (vertebra,) = printed().report()["vertebrae"]
     assert (vertebra["solid_of"], vertebra["iso_value_hu"]) == ("cortex", 200.0)
     assert vertebra["cortex"]["moved"] > 0
-    solid_line = _describe_vertebra(vertebra)[1]
+    _, solid_line, *_ = _describe_vertebra(vertebra)
     assert "200 HU, " in solid_line
     assert "error 0." in solid_line
 

@@ -23,26 +23,26 @@ from clrecon.proof.phantom import PhantomSettings, write_phantom
 
 
 @pytest.fixture(scope="module")
-def sphere(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+def sphere_and_truth(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     """The folder of a CT of a sphere, its gantry tilted by 15 degrees and its axes turned, and the truth."""
     folder = tmp_path_factory.mktemp("jobs") / "ct"
     settings = PhantomSettings(
-        kind="sphere",
-        size=(44, 60),
-        slices=31,
-        spacing=(0.5, 0.7, 1.0),
-        tilt=15.0,
-        oblique=(20.0, 5.0, -40.0),
-        noise=0.0,
+        kind="sphere", size=(44, 60), slices=31, spacing=(0.5, 0.7, 1.0), tilt=15.0, oblique=(20.0, 5.0, -40.0), noise=0
     )
     return folder, write_phantom(folder, settings)
 
 
+@pytest.fixture(scope="module")
+def sphere(sphere_and_truth: tuple[Path, dict[str, Any]]) -> Path:
+    folder, _ = sphere_and_truth
+    return folder
+
+
 @pytest.mark.every_device
 def test_mesh_of_a_tilted_oblique_sphere_has_its_volume_and_place(
-    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
+    device: Any, sphere_and_truth: tuple[Path, dict[str, Any]], tmp_path: Path
 ) -> None:
-    folder, truth = sphere
+    folder, truth = sphere_and_truth
     settings = MeshSettings(iso_value=truth["iso_value_hu"], device=str(device.index))
 
     report = make_mesh(folder, tmp_path / "sphere.stl", settings, measure=True)
@@ -55,13 +55,11 @@ def test_mesh_of_a_tilted_oblique_sphere_has_its_volume_and_place(
     assert centre == pytest.approx(truth["surface"]["center_lps_mm"], abs=0.1)  # a fifth of the smallest spacing
 
 
-def test_progress_of_a_mesh_job_names_its_stages_in_order(
-    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
-) -> None:
+def test_progress_of_a_mesh_job_names_its_stages_in_order(device: Any, sphere: Path, tmp_path: Path) -> None:
     stages: list[str] = []
 
     make_mesh(
-        sphere[0],
+        sphere,
         tmp_path / "sphere.stl",
         MeshSettings(device=str(device.index)),
         measure=True,
@@ -71,20 +69,16 @@ def test_progress_of_a_mesh_job_names_its_stages_in_order(
     assert list(dict.fromkeys(stages)) == ["device", "scan", "read", "build", "measure", "write"]
 
 
-def test_times_of_stages_sum_to_the_total_of_the_report(
-    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
-) -> None:
-    report = make_mesh(sphere[0], tmp_path / "a.ply", MeshSettings(device=str(device.index)))
+def test_times_of_stages_sum_to_the_total_of_the_report(device: Any, sphere: Path, tmp_path: Path) -> None:
+    report = make_mesh(sphere, tmp_path / "a.ply", MeshSettings(device=str(device.index)))
 
     seconds = dict(report["seconds"])
     total = seconds.pop("total")
     assert total == pytest.approx(sum(seconds.values()), abs=0.01)  # each is rounded to 0.1 ms
 
 
-def test_mesh_that_is_not_measured_has_no_volume_and_no_quality(
-    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
-) -> None:
-    report = make_mesh(sphere[0], tmp_path / "a.ply", MeshSettings(device=str(device.index)))
+def test_mesh_that_is_not_measured_has_no_volume_and_no_quality(device: Any, sphere: Path, tmp_path: Path) -> None:
+    report = make_mesh(sphere, tmp_path / "a.ply", MeshSettings(device=str(device.index)))
     assert (report["volume_ml"], report["quality"]) == (None, None)
 
 
@@ -100,7 +94,7 @@ def test_mesh_job_refuses_a_wrong_device_before_a_missing_scan(tmp_path: Path) -
 
 @pytest.mark.parametrize("failing_step", daily(1, ["clrecon.jobs.run.stage_mesh", "clrecon.jobs.run.stage_report"]))
 def test_older_mesh_and_report_stay_where_one_of_them_cannot_be_written(
-    failing_step: str, device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    failing_step: str, device: Any, sphere: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     mesh, report = tmp_path / "a.stl", tmp_path / "a.json"
     mesh.write_bytes(b"old mesh")
@@ -111,7 +105,7 @@ def test_older_mesh_and_report_stay_where_one_of_them_cannot_be_written(
 
     monkeypatch.setattr(failing_step, fail)
     with refused(OutputError, "full"):
-        make_mesh(sphere[0], mesh, MeshSettings(device=str(device.index)), report_path=report)
+        make_mesh(sphere, mesh, MeshSettings(device=str(device.index)), report_path=report)
 
     assert (mesh.read_bytes(), report.read_bytes()) == (b"old mesh", b"old report")
     assert sorted(tmp_path.iterdir()) == [report, mesh]
@@ -119,12 +113,12 @@ def test_older_mesh_and_report_stay_where_one_of_them_cannot_be_written(
 
 @pytest.mark.parametrize("level", [-5000.0, -1000.0], ids=["below every voxel", "at the lowest voxel"])
 def test_iso_value_with_every_voxel_inside_is_refused_with_the_range_of_the_scan(
-    level: float, device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
+    level: float, device: Any, sphere: Path, tmp_path: Path
 ) -> None:
     settings = MeshSettings(iso_value=level, device=str(device.index))
 
-    with refused(NoSurfaceError, -1000, 1000):
-        make_mesh(sphere[0], tmp_path / "box.stl", settings)
+    with refused(NoSurfaceError, -1000, 1000):  # HU of the air and of the sphere
+        make_mesh(sphere, tmp_path / "box.stl", settings)
 
     assert not list(tmp_path.iterdir())
 

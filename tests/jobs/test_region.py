@@ -30,6 +30,7 @@ BONE_HU = 200
 
 
 def make_voxels() -> np.ndarray:
+    """HU of the scan, int16 [k, j, i]."""
     k, j, i = np.indices(SHAPE).astype(np.float64)
 
     def away(centre: np.ndarray) -> np.ndarray:
@@ -48,8 +49,8 @@ def to_lps(ijk: Any) -> np.ndarray:
     return np.asarray(ijk) @ AFFINE[:3, :3].T + AFFINE[:3, 3]
 
 
-def box_around(centre: np.ndarray, mm: float, space: str = "lps") -> str:
-    low, high = to_lps(centre) - mm, to_lps(centre) + mm
+def box_around(centre: np.ndarray, half_side_mm: float, space: str = "lps") -> str:
+    low, high = to_lps(centre) - half_side_mm, to_lps(centre) + half_side_mm
     if space == "ras":
         low[:2], high[:2] = -high[:2], -low[:2]
     return "box:" + ",".join(f"{value:.3f}" for pair in zip(low, high, strict=True) for value in pair)
@@ -57,6 +58,7 @@ def box_around(centre: np.ndarray, mm: float, space: str = "lps") -> str:
 
 @pytest.fixture(scope="module")
 def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two balls, of which one is hollow, joined by a rod, and a block; see `make_voxels`."""
     path = tmp_path_factory.mktemp("region") / "scan.nrrd"
     write_nrrd(path, make_voxels(), AFFINE)
     return path
@@ -64,6 +66,7 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def map_file(scan: Path) -> Path:
+    """A label map of the scan: 2 about the small ball, 3 about the block."""
     labels = np.zeros(SHAPE, np.uint8)
     labels[5:24, 5:26, 30:46] = 2
     labels[30:37, 33:40, 38:45] = 3
@@ -85,8 +88,8 @@ def mesh_with(device: Any, scan: Path, tmp_path: Path, capsys: pytest.CaptureFix
     return run
 
 
-HALF_SIDE_MM, VOXEL_MM = 6.43, 0.8
-"""Of a box that holds the small ball and no other bone."""
+HALF_SIDE_MM, LARGE_HALF_SIDE_MM, VOXEL_MM = 6.43, 8.4, 0.8
+"""Of boxes that hold the small ball and no other bone, and the large one, of 9.3 voxels."""
 
 
 def test_scan_without_a_region_is_meshed_whole(mesh_with: Any) -> None:
@@ -174,7 +177,7 @@ def test_report_of_opening_counts_the_bone_that_it_took_and_warns_of_it(mesh_wit
 
 
 def test_filling_adds_the_voxels_of_the_hollow_of_a_ball(mesh_with: Any) -> None:
-    report, _ = mesh_with("--preprocess", "fill", "--region", box_around(LARGE, 8.4))
+    report, _ = mesh_with("--preprocess", "fill", "--region", box_around(LARGE, LARGE_HALF_SIDE_MM))
 
     k, j, i = np.indices(SHAPE)
     in_the_hollow = np.sqrt((i - LARGE[0]) ** 2 + (j - LARGE[1]) ** 2 + (k - LARGE[2]) ** 2) < 5.0
@@ -184,13 +187,13 @@ def test_filling_adds_the_voxels_of_the_hollow_of_a_ball(mesh_with: Any) -> None
 
 
 def test_steps_and_the_region_among_them_are_reported_in_their_order(mesh_with: Any) -> None:
-    box = box_around(LARGE, 8.4)
+    box = box_around(LARGE, LARGE_HALF_SIDE_MM)
 
     report, _ = mesh_with("--preprocess", "bilateral:0.8:30,region,level:250,fill", "--region", box)
 
-    steps = report["volume"]["preprocess"]
+    *_, fill = steps = report["volume"]["preprocess"]
     assert [step["step"] for step in steps] == ["bilateral:0.8:30", "region", "level:250", "fill"]
-    assert steps[3]["band_hu"] == [250.0, None]  # of the level set before
+    assert fill["band_hu"] == [250.0, None]  # of the level set before
     assert all(step["seconds"] >= 0.0 for step in steps)
     assert report["volume"]["region"]["rules"] == [str(parse_region_rules(box)[0])]
 

@@ -28,11 +28,11 @@ from clrecon.jobs.options import (
         ("box:,2,3,,5,", RegionRule("box", (-math.inf, 2.0, 3.0, math.inf, 5.0, math.inf))),
         ("HU:200,", RegionRule("hu", (200.0, math.inf))),
         ("hu:100,100", RegionRule("hu", (100.0, 100.0))),
-        ("label:spine.nii.gz:T12", RegionRule("label", (), "spine.nii.gz", "T12")),
-        ("label:C:\\maps\\spine.nii:28", RegionRule("label", (), "C:\\maps\\spine.nii", "28")),
-        ("mask:a/b:c.nrrd", RegionRule("mask", (), "a/b:c.nrrd")),
+        ("label:spine.nii.gz:T12", RegionRule("label", path="spine.nii.gz", name="T12")),
+        ("label:C:\\maps\\spine.nii:28", RegionRule("label", path="C:\\maps\\spine.nii", name="28")),
+        ("mask:a/b:c.nrrd", RegionRule("mask", path="a/b:c.nrrd")),
         ("tube:30", RegionRule("tube", (30.0,))),
-        ("tube:30:line.csv", RegionRule("tube", (30.0,), "line.csv")),
+        ("tube:30:line.csv", RegionRule("tube", (30.0,), path="line.csv")),
     ],
 )
 def test_rule_of_a_region_is_read_with_its_numbers_file_and_label(text: str, rule: RegionRule) -> None:

@@ -36,7 +36,9 @@ def test_picture_of_vertebrae_is_named_after_the_label_map_beside_it(kind: str) 
 
 
 def test_band_of_a_surface_holds_the_hu_that_it_encloses() -> None:
-    surfaces = [Surface("", 200.0), Surface("", -400.0, below=True), Surface("", (100.0, 300.0)), Surface("", None)]
+    above, below = Surface("", iso_value=200.0), Surface("", iso_value=-400.0, below=True)
+    between, of_a_mask = Surface("", iso_value=(100.0, 300.0)), Surface("", iso_value=None)
+    surfaces = [above, below, between, of_a_mask]
     assert make._bands_of(surfaces) == [(200.0, math.inf), (-math.inf, -400.0), (100.0, 300.0)]
 
 
@@ -185,8 +187,9 @@ def test_corridor_with_a_radius_has_the_diameter_of_a_screw_and_one_without_has_
         *("by_hu_share", "width_voxels"),
     )
     corridor: Any = SimpleNamespace(**dict.fromkeys(names), radius=radius)
-    found = corridor_results.describe_corridor(corridor, 1.0, "LPS")["screw_diameter_mm"]
-    assert found == (None if radius is None else screw_diameter(radius, 1.0))
+    margin_mm = 1.0
+    found = corridor_results.describe_corridor(corridor, margin_mm, "LPS")["screw_diameter_mm"]
+    assert found == (None if radius is None else screw_diameter(radius, margin_mm))
 
 
 def test_file_in_lps_has_no_warning_of_its_frame() -> None:
@@ -220,11 +223,14 @@ def test_meshes_of_a_page_get_the_given_names_then_numbers_and_one_colour_a_file
     assert second.report["color"] == third.report["color"] != red
 
 
-def warn_of_surface(monkeypatch: pytest.MonkeyPatch, looks_like: str, bones: Any, contrast_share: float) -> list[str]:
+def warn_of_surface(
+    monkeypatch: pytest.MonkeyPatch, *, looks_like: str, contrast_share: float, bones: Any = None
+) -> list[str]:
     """Warnings for a surface whose walls look so, in a scan with this share of contrast medium."""
     monkeypatch.setattr(bone, "warn_of_contrast", lambda choice: ["contrast"])
     (surface,) = plan_surfaces([200.0])
-    look = WallLook(looks_like, 0.0, 0.0, 0.0, {"median": 300.0, "p99": 400.0}, 1000)
+    shares = dict.fromkeys(("compact_share", "contrast_share", "metal_share"), 0.0)
+    look = WallLook(looks_like, **shares, wall_hu={"median": 300.0, "p99": 400.0}, samples=1000)
     part: Any = SimpleNamespace(surface=surface, bones=bones, facts={"walls": look})
     choice: Any = SimpleNamespace(contrast_medium_share=contrast_share)
     return bone.warn_of_walls([part], MeshSettings(), choice)
@@ -234,28 +240,30 @@ BONELESS = SimpleNamespace(bone=0, components=3, rails=0)
 
 
 def test_surface_of_contrast_medium_is_warned_of_with_advice(monkeypatch: pytest.MonkeyPatch) -> None:
-    contrast, whole = warn_of_surface(monkeypatch, "contrast medium", None, contrast_share=0.3)
+    contrast, whole = warn_of_surface(monkeypatch, looks_like="contrast medium", contrast_share=0.3)
 
     assert contrast == "contrast"
     assert "keeps what looks like bone" in whole
 
 
 def test_surface_without_bone_has_no_advice_on_contrast_medium(monkeypatch: pytest.MonkeyPatch) -> None:
-    (warning,) = warn_of_surface(monkeypatch, "no bone", BONELESS, contrast_share=0.3)
+    (warning,) = warn_of_surface(monkeypatch, looks_like="no bone", bones=BONELESS, contrast_share=0.3)
     assert "nothing here looks like bone, none of 3 components" in warning
 
 
 def test_surface_without_bone_is_warned_of_too_where_contrast_medium_is_not_counted(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    contrast, none = warn_of_surface(monkeypatch, "no bone", BONELESS, contrast_share=0.0)
+    contrast, none = warn_of_surface(monkeypatch, looks_like="no bone", bones=BONELESS, contrast_share=0.0)
 
     assert contrast == "contrast"
     assert "nothing here looks like bone" in none
 
 
 @pytest.mark.parametrize(
-    ("depth", "values", "words"), [(5.0, None, None), (np.nan, None, "nothing of the"), (5.0, np.nan, None)]
+    ("depth", "values", "words"),
+    [(5.0, None, None), (np.nan, None, "nothing of the"), (5.0, np.nan, None)],
+    ids=["a surface is hit", "nothing is hit", "hit, without values"],
 )
 def test_picture_without_any_depth_is_warned_of_as_empty(depth: float, values: float | None, words: str | None) -> None:
     def full(value: float) -> np.ndarray:

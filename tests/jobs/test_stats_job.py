@@ -109,13 +109,14 @@ def test_stats_of_a_chosen_label_are_of_it_alone(stats_command: list[str], print
 
 @pytest.fixture
 def stats_report(stats_command: list[str], printed: Printer) -> Any:
+    """The report of the command for both labels."""
     assert main([*stats_command, "--json"]) == 0
     return printed().report()
 
 
 @pytest.mark.parametrize("columns", [None, 200], ids=["no terminal", "a wide terminal"])
 def test_table_of_stats_is_one_with_a_line_for_each_label(columns: int | None, stats_report: Any) -> None:
-    heading, named, unnamed = _lay_out(stats_report, columns)
+    heading, named, unnamed = _lay_out(stats_report, width=columns)
 
     assert heading.split()[0] == "label"
     assert named.startswith("a very long name of a structure in the belly")
@@ -123,14 +124,14 @@ def test_table_of_stats_is_one_with_a_line_for_each_label(columns: int | None, s
 
 
 def test_table_of_stats_is_split_into_two_in_a_narrow_terminal(stats_report: Any) -> None:
-    lines = _lay_out(stats_report, 60)
+    lines = _lay_out(stats_report, width=60)
 
     assert max(map(len, lines)) <= 60
-    first, second = lines[:3], lines[4:]  # an empty line stands between them
-    assert first[1].startswith("a very long name")
-    assert "..." in second[1]
-    assert second[1].split()[-1] == "107"  # the last column: the largest HU
-    assert len(second) == len(first)
+    _, named, _, empty, _, named_again, _ = lines  # headings, and the label without a name in both tables
+    assert empty == ""
+    assert named.startswith("a very long name")
+    assert "..." in named_again
+    assert named_again.split()[-1] == "107"  # the last column: the largest HU
 
 
 @pytest.mark.parametrize(
@@ -209,14 +210,11 @@ def shell_rows(shells: dict[str, str], device: Any, tmp_path_factory: pytest.Tem
         return list(csv.DictReader(stream))
 
 
-@pytest.mark.parametrize(
-    ("shell", "radius", "thickness"),
-    [pytest.param(0, *SHELLS_MM[0], id="large"), pytest.param(1, *SHELLS_MM[1], id="small")],
-)
+@pytest.mark.parametrize("shell", [0, 1], ids=["large", "small"])
 def test_surface_fitted_to_the_cortex_of_a_label_has_the_volume_area_and_wall_of_its_shell(
-    shell: int, radius: float, thickness: float, shell_rows: list[dict[str, str]]
+    shell: int, shell_rows: list[dict[str, str]]
 ) -> None:
-    row = shell_rows[shell]
+    row, (radius, thickness) = shell_rows[shell], SHELLS_MM[shell]
 
     volume_ml, area_mm2 = 4 / 3 * np.pi * radius**3 / 1000, 4 * np.pi * radius**2
     assert float(row["surface_ml"]) == pytest.approx(volume_ml, rel=tolerances.CORTEX_SHELL_VOLUME)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from clrecon.cli.main import main
 from clrecon.labels import read_labels, resample_labels
 from clrecon.proof.phantom import PhantomSettings, write_phantom
 from clrecon.reading import read_volume
+from clrecon.spine.regions import WEIGHTS
 
 pytest.importorskip("nibabel")
 
@@ -68,14 +70,15 @@ def test_report_of_vertebrae_has_no_hash_of_the_series_and_warnings_once(written
     assert "warnings" not in report["volume"]
 
 
-def test_picture_of_vertebrae_has_a_yellow_line_for_each_disc(written: Path) -> None:
+def test_picture_of_vertebrae_has_a_yellow_line_for_each_disc_and_both_ends(written: Path) -> None:
     with Image.open(written / "a.png") as picture:
         pixels = np.asarray(picture.convert("RGB")).astype(int)
 
     assert pixels.shape[0] > 3 * 100  # 3 rows a mm of the spine from L1 to L3; 354 were measured
     yellow_rows = np.flatnonzero((np.abs(pixels - [255, 230, 0]).max(axis=2) < 10).any(axis=1))
     lines = 1 + np.count_nonzero(np.diff(yellow_rows) > 20)  # rows apart
-    assert lines >= 2
+    discs, ends = 2, 2
+    assert lines == discs + ends
 
 
 @pytest.mark.release
@@ -194,6 +197,9 @@ def doubted_middle(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(split, "judge", judge)
 
 
+CONFIDENCE_OF_THE_DOUBTED = math.exp(-(WEIGHTS["volume"] + WEIGHTS["arch"] + (1.0 - 0.9) * WEIGHTS["line"]))
+
+
 @pytest.mark.usefixtures("doubted_middle")
 @pytest.mark.seconds
 def test_vertebra_of_low_confidence_is_left_out_with_its_reasons_and_exit_code_8(
@@ -204,7 +210,7 @@ def test_vertebra_of_low_confidence_is_left_out_with_its_reasons_and_exit_code_8
     assert read_labels(tmp_path / "a.nii.gz").numbers == (1, 3)
     printed = capsys.readouterr()
     reasons = "is not in the label map: a greater one; a doubt of the test"
-    assert f"vertebra_2 has low confidence (0.42) and {reasons}" in printed.err
+    assert f"vertebra_2 has low confidence ({CONFIDENCE_OF_THE_DOUBTED:.2f}) and {reasons}" in printed.err
     assert "1 of low confidence" in printed.out
 
 
@@ -216,7 +222,7 @@ def test_vertebra_of_low_confidence_is_kept_on_request_with_exit_code_8(
     assert main(["vertebrae", str(scan), "-o", str(tmp_path / "a.nii.gz"), "--keep-unsure"]) == 8
 
     assert read_labels(tmp_path / "a.nii.gz").numbers == (1, 2, 3)
-    printed().assert_error("vertebra_2", 0.42)
+    printed().assert_error("vertebra_2", round(CONFIDENCE_OF_THE_DOUBTED, 2))
 
 
 @pytest.mark.parametrize(

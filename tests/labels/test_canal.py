@@ -11,7 +11,7 @@ from clrecon.geometry import Volume
 from clrecon.labels.canal import _Places, find_canal
 
 BODY, PEDICLES, LAMINA = (0, 30), (8, 22), (8, 14)
-"""Heights in mm of the parts of a make_block; the canal is 20 mm wide and 16 mm deep between them."""
+"""Heights in mm of the parts of a block; the canal is 20 mm wide and 16 mm deep between them."""
 
 
 def make_block(spacing=(1.0, 1.0, 1.0), tilt=0.0, lamina=LAMINA, pedicles=PEDICLES, gap=0.0):

@@ -116,7 +116,7 @@ def test_large_segmentation_of_less_than_8_times_the_voxels_of_its_scan_is_read(
 def test_large_segmentation_out_of_proportion_is_refused_before_it_is_unpacked(tmp_path, monkeypatch, kind, syntax):
     path = write_seg(tmp_path / "a.dcm", masks_of_two(), ct_slices(PLAN), kind=kind, syntax=syntax)
     monkeypatch.setattr("clrecon.labels.segmentation._FramePixels", None)  # cannot be called
-    with refused(RefusedInputError, "a.dcm", 9, 6, 5):
+    with refused(RefusedInputError, "a.dcm", 9, 6, 5):  # voxels along i, j and k
         read_labels(path, volume=SCAN_OF_30_VOXELS)
 
 
@@ -303,7 +303,7 @@ def test_real_segmentation_and_nrrd_of_one_liver_give_the_same_voxels(real_data)
 
 def test_real_segmentation_whose_segments_overlap_is_refused_unless_one_is_chosen(real_data):
     path = real_data / "seg_and_labels" / "partial_overlaps.dcm"
-    with refused(RefusedInputError, "GREEN", "ORANGE", 3017):
+    with refused(RefusedInputError, "GREEN", "ORANGE", 3017):  # voxels that both hold in this file
         read_labels(path)
     assert read_labels(path, ["green"]).find("GREEN") == 1
 
@@ -334,6 +334,7 @@ def test_frames_of_a_label_map_that_give_voxels_two_segments_are_refused(tmp_pat
         return [(2 * (pixels == 1).astype(np.uint8), group) for pixels, group in frames if (pixels == 1).any()]
 
     edit_frames(path, lambda frames: [*frames, *repeat_segment_1_as_2(frames)])
+    # T12 has 3 x 5 voxels in a slice.
     words = "two of its frames lie at one place, slice . of 5, and give 15 voxels two segments, 1 and 2$"
     with pytest.raises(RefusedInputError, match=words):
         read_labels(path)
@@ -378,5 +379,5 @@ def test_different_frames_of_a_segment_at_one_place_are_refused(tmp_path):
     """They are two states of one segment, as at several points in time."""
     path = write_seg(tmp_path / "a.dcm", masks_of_two(), ct_slices(PLAN))
     append_frame_at_the_place_of_the_second(path, np.zeros_like)
-    with refused(RefusedInputError, "slice", "segment", 1, 5):
+    with refused(RefusedInputError, "slice", "segment", 1, 5):  # segment 1, and 5 slices
         read_labels(path)

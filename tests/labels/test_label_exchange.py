@@ -217,7 +217,7 @@ def test_frame_given_with_an_array_goes_before_that_of_the_volume() -> None:
 
 
 def test_array_of_another_shape_than_its_volume_is_refused() -> None:
-    with refused(UsageError, 3, 4, 5):
+    with refused(UsageError, 3, 4, 5):  # the shape of the array
         LabelMap(ARRAY_OF_ONES, volume_in_frame_f()[1:])
 
 

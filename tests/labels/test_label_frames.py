@@ -15,6 +15,7 @@ SQUARE = (1, 0, 0, 0, 1, 0)
 
 
 def group_with(sequence, **values):
+    """A functional group: a sequence of this name whose one item has these elements."""
     inner, outer = Dataset(), Dataset()
     for keyword, value in values.items():
         setattr(inner, keyword, value if isinstance(value, str | float) else list(value))

@@ -52,8 +52,8 @@ def test_body_of_a_vertebra_is_not_found_as_the_vertebra():
 @pytest.mark.parametrize(
     ("label", "facts"),
     [
-        pytest.param("rib", (7, 12, 8, 11), id="part of two names"),
-        pytest.param("L5", (2, 5, 7, 12), id="level that is not there"),
+        pytest.param("rib", (7, 12, 8, 11), id="part of two names"),  # 7 rib left 12 and 8 rib left 11
+        pytest.param("L5", (2, 5, 7, 12), id="level that is not there"),  # 2, 5, 7 rib left 12
         pytest.param("absent", ("absent",), id="name without a voxel"),
         pytest.param(99, (99,), id="number that is not there"),
         pytest.param("a\nb\x1b", ("x1b",), id="control characters"),

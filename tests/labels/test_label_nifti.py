@@ -86,7 +86,8 @@ def test_sform_is_used_before_a_qform_that_disagrees_with_a_warning(tmp_path):
     overwrite_field(path, "sform", *np.ravel(five_mm_to_the_right))
     labels = read_labels(path)
     assert labels.affine[0, 3] == -5.0
-    assert "5 mm apart" in labels.warnings[0]
+    (warning,) = labels.warnings
+    assert "5 mm apart" in warning
 
 
 def test_map_without_a_sform_is_placed_by_its_qform(tmp_path):
@@ -324,5 +325,5 @@ def test_corrupt_qform_without_a_sform_is_refused(tmp_path):
     path = write_nifti(tmp_path / "a.nii", make_labels(), RIGID, qform=True)
     overwrite_field(path, "pixdim", 3.0)
     overwrite_field(path, "sform_code", 0)
-    with refused(RefusedInputError, "NIfTI", 0, 1, -1):
+    with refused(RefusedInputError, "NIfTI", 0, 1, -1):  # pixdim[0] is 1 or -1
         read_labels(path)

@@ -29,7 +29,8 @@ def edit(path, *replacements):
     return path
 
 
-def segment(n, name, value, layer=None):
+def segment(n, name, *, value, layer=None):
+    """Fields of the segment `n` of 3D Slicer."""
     fields = {f"Segment{n}_Name": name, f"Segment{n}_LabelValue": str(value), f"Segment{n}_ID": f"id{n}"}
     return fields if layer is None else {**fields, f"Segment{n}_Layer": str(layer)}
 
@@ -59,14 +60,14 @@ def test_voxel_of_an_nrrd_lies_where_simpleitk_puts_it(tmp_path):
 
 
 def test_segments_of_slicer_are_found_by_their_names(tmp_path):
-    fields = segment(0, "L1 vertebra", 2)
+    fields = segment(0, "L1 vertebra", value=2)
     labels = read_labels(write_nrrd(tmp_path / "a.seg.nrrd", make_labels(numbers=(0, 2)), **fields))
     assert labels.names == {2: "L1 vertebra"}
     assert labels.find("l1 VERTEBRA") == labels.find("L1") == 2
 
 
 def test_control_characters_of_a_segment_name_are_left_out(tmp_path):
-    fields = segment(0, "bad\x1b[31m", 5)
+    fields = segment(0, "bad\x1b[31m", value=5)
     labels = read_labels(write_nrrd(tmp_path / "a.seg.nrrd", make_labels(numbers=(0, 5)), **fields))
     assert labels.names[5].startswith("bad")
     assert "\x1b" not in labels.names[5]
@@ -78,7 +79,11 @@ def segments_in_two_layers(overlap: bool = False):
     voxels[0, 0, :3, 0] = 1
     voxels[0, 0, 2 if overlap else 3, 1] = 1
     voxels[2, 3, 4, 1] = 2
-    return voxels, {**segment(0, "one", 1, 0), **segment(1, "two", 1, 1), **segment(2, "three", 2, 1)}
+    return voxels, {
+        **segment(0, "one", value=1, layer=0),
+        **segment(1, "two", value=1, layer=1),
+        **segment(2, "three", value=2, layer=1),
+    }
 
 
 def test_segments_in_two_layers_are_read_as_one_map(tmp_path):
@@ -100,7 +105,7 @@ def overlapping_segments(tmp_path):
 
 
 def test_segments_that_overlap_are_refused(overlapping_segments):
-    with refused(RefusedInputError, "one", "two", 1, 2):
+    with refused(RefusedInputError, "one", "two", 1, 2):  # their numbers
         read_labels(overlapping_segments)
 
 
@@ -194,15 +199,24 @@ def layers_with_values_1_and_2(*segments):
 @pytest.mark.parametrize(
     ("segments", "words"),
     [
-        ([segment(0, "one", 1), segment(1, "two", 2)], "2 layers, and 2 of its 2 segments have no Layer"),
-        ([segment(0, "one", 1, 0), segment(1, "two", 2)], "2 layers, and 1 of its 2 segments have no Layer"),
+        ([segment(0, "one", value=1), segment(1, "two", value=2)], "2 layers, and 2 of its 2 segments have no Layer"),
         (
-            [segment(0, "one", 1, 0), {"Segment1_Name": "two", "Segment1_Layer": "1"}],
+            [segment(0, "one", value=1, layer=0), segment(1, "two", value=2)],
+            "2 layers, and 1 of its 2 segments have no Layer",
+        ),
+        (
+            [segment(0, "one", value=1, layer=0), {"Segment1_Name": "two", "Segment1_Layer": "1"}],
             "1 of its 2 .* have no LabelValue",
         ),
-        ([segment(0, "one", 1, 0), segment(1, "two", 2, 2)], "has 2 layers, and a segment is in layer 2"),
-        ([segment(0, "one", 1, 0), segment(1, "two", 2, -1)], "has 2 layers, and a segment is in layer -1"),
-        ([segment(0, "one", 1, "x")], "corrupt NRRD header: Layer of a segment is no number"),
+        (
+            [segment(0, "one", value=1, layer=0), segment(1, "two", value=2, layer=2)],
+            "has 2 layers, and a segment is in layer 2",
+        ),
+        (
+            [segment(0, "one", value=1, layer=0), segment(1, "two", value=2, layer=-1)],
+            "has 2 layers, and a segment is in layer -1",
+        ),
+        ([segment(0, "one", value=1, layer="x")], "corrupt NRRD header: Layer of a segment is no number"),
         ([], "has 2 layers and does not say which segments they hold"),
     ],
 )
@@ -213,7 +227,9 @@ def test_layers_whose_segments_are_not_known_are_refused(tmp_path, segments, wor
 
 
 def test_segments_of_value_0_and_values_of_no_segment_are_warned_of(tmp_path):
-    voxels, fields = layers_with_values_1_and_2(segment(0, "one", 1, 0), segment(1, "air", 0, 1), segment(2, "x", 3, 1))
+    voxels, fields = layers_with_values_1_and_2(
+        segment(0, "one", value=1, layer=0), segment(1, "air", value=0, layer=1), segment(2, "x", value=3, layer=1)
+    )
     labels = read_labels(write_nrrd(tmp_path / "a.seg.nrrd", voxels, **fields))
     assert labels.counts == {1: 1}
     assert "air" not in labels.names.values()
@@ -234,14 +250,15 @@ def test_segments_without_layer_and_value_are_those_of_the_layers_with_a_warning
 
 
 def test_one_segment_without_layer_and_value_is_the_whole_map_without_a_warning(tmp_path):
-    voxels = (layers_with_values_1_and_2()[0][..., 0] > 0).astype(np.uint8)
+    layers, _ = layers_with_values_1_and_2()
+    voxels = layers[..., 0].astype(np.uint8)
     labels = read_labels(write_nrrd(tmp_path / "b.seg.nrrd", voxels, Segment0_Name="x"))
     assert labels.names == {1: "x"}
     assert labels.warnings == ()
 
 
 def test_segment_without_a_value_is_warned_of_and_its_name_is_not_used(tmp_path):
-    fields = {**segment(0, "two", 2), "Segment1_Name": "lost", "Segment1_ID": "x"}
+    fields = {**segment(0, "two", value=2), "Segment1_Name": "lost", "Segment1_ID": "x"}
     labels = read_labels(write_nrrd(tmp_path / "a.seg.nrrd", make_labels(numbers=(0, 2, 5)), **fields))
     assert labels.names == {2: "two", 5: "label_5"}
     assert labels.warnings == ("1 of 2 segments have no LabelValue: their names are not known",)

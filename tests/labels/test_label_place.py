@@ -58,6 +58,7 @@ OTHER_AFFINES = {
             0,
             "step along i (-0.8, 0, 0) and (0.8, 0, 0), step along j (0, -0.9, 0) and (0, 0.9, 0)",
         ),
+        # Rows 2 to 7 and columns 3 to 5 exchanged have 9 of 18 in common.
         ("rows and columns exchanged", 50, "step along i (0, 0.9, 0) and (0.8, 0, 0)"),
         ("three voxels aside", 0, "first voxel (-27.6, 20, 200) and (-30, 20, 200) mm"),
     ],

@@ -16,7 +16,7 @@ from clrecon.geometry import Volume
 from clrecon.labels import LabelMap, resample_labels
 from clrecon.labels.resample import _shares_of_bone, _take_aligned
 
-VOXELS = make_labels((5, 7, 8))
+VOXELS = make_labels((5, 7, 8), numbers=(0, 0, 2, 5))
 VOLUME = Volume(np.zeros((5, 7, 8), np.int16), OBLIQUE)
 
 
@@ -151,7 +151,8 @@ def test_array_in_place_of_a_label_map_is_refused():
 NUMBERS = np.arange(60, dtype=np.int16).reshape(3, 4, 5)
 
 
-def take_aligned(labels, shape, shift):
+def take_aligned(labels, *, shape, shift):
+    """Labels on a grid of `shape` [k, j, i] whose first voxel lies at `shift` (x, y, z); None where they do not fit."""
     affine = np.eye(4)
     affine[:3, 3] = shift
     return _take_aligned(labels, Volume(np.zeros(shape, np.int16), affine))
@@ -166,16 +167,16 @@ def take_aligned(labels, shape, shift):
     ],
 )
 def test_voxels_of_an_aligned_map_are_cut_out_and_zeros_put_beyond_it(shape, shift, expected):
-    np.testing.assert_array_equal(take_aligned(LabelMap(NUMBERS, np.eye(4)), shape, shift), expected)
+    np.testing.assert_array_equal(take_aligned(LabelMap(NUMBERS, np.eye(4)), shape=shape, shift=shift), expected)
 
 
 def test_map_on_the_grid_of_the_volume_is_not_copied():
     labels = LabelMap(NUMBERS, np.eye(4))
-    assert np.shares_memory(take_aligned(labels, (3, 4, 5), (0, 0, 0)), labels.voxels)
+    assert np.shares_memory(take_aligned(labels, shape=(3, 4, 5), shift=(0, 0, 0)), labels.voxels)
 
 
 def test_map_half_a_voxel_aside_is_not_aligned():
-    assert take_aligned(LabelMap(NUMBERS, np.eye(4)), (3, 4, 5), (0.5, 0, 0)) is None
+    assert take_aligned(LabelMap(NUMBERS, np.eye(4)), shape=(3, 4, 5), shift=(0.5, 0, 0)) is None
 
 
 def test_slices_leave_memory_one_by_one_while_shares_of_bone_are_counted(monkeypatch):

@@ -1,4 +1,4 @@
-"""What the header_with of a SEG may say, with data sets made by hand: sizes to the byte, elements that occur twice."""
+"""What the header of a SEG may say, with data sets made by hand: sizes to the byte, elements that occur twice."""
 
 from __future__ import annotations
 
@@ -32,6 +32,10 @@ def header_with(kind="LABELMAP", bits=8, syntax=ExplicitVRLittleEndian, **values
     return data_set
 
 
+def layout_of(kind, *, rows, columns, frames, bits):
+    return _Layout(kind, rows, columns, frames, bits)
+
+
 @pytest.mark.parametrize(
     ("kind", "bits", "syntax", "least_bytes"),
     [
@@ -44,7 +48,7 @@ def header_with(kind="LABELMAP", bits=8, syntax=ExplicitVRLittleEndian, **values
 )
 def test_header_of_three_frames_is_read_from_a_file_that_can_hold_their_pixels(kind, bits, syntax, least_bytes):
     data_set = header_with(kind, bits, syntax, NumberOfFrames=3)
-    assert _read_layout(data_set, "a.dcm", least_bytes) == _Layout(kind, 10, 10, 3, bits)
+    assert _read_layout(data_set, "a.dcm", least_bytes) == layout_of(kind, rows=10, columns=10, frames=3, bits=bits)
     with refused(RefusedInputError, "a.dcm", 10):
         _read_layout(data_set, "a.dcm", least_bytes - 1)
 
@@ -72,14 +76,16 @@ def test_a_million_frames_are_accepted():
 def test_pixels_of_one_bit_are_read_over_the_ends_of_bytes_to_the_last_bit():
     # 3 frames of 3 x 3 pixels are 27 bits: 4 bytes; the second frame begins at bit 9.
     data = bytes([0b11111111, 0b00000011, 0b00000000, 0b00000100])
-    pixels = _FramePixels(header_with("BINARY", 1, PixelData=data), _Layout("BINARY", 3, 3, 3, 1), "a.dcm")
+    layout = layout_of("BINARY", rows=3, columns=3, frames=3, bits=1)
+    pixels = _FramePixels(header_with("BINARY", bits=1, PixelData=data), layout, "a.dcm")
     frames = [pixels.read(frame).ravel().tolist() for frame in range(3)]
     assert frames == [[1] * 9, [1] + [0] * 8, [0] * 8 + [1]]
 
 
 def test_pixels_of_one_bit_that_lack_their_last_byte_are_refused():
+    layout = layout_of("BINARY", rows=3, columns=3, frames=3, bits=1)  # 27 bits need 4 bytes
     with refused(RefusedInputError, 3, "frames"):
-        _FramePixels(header_with("BINARY", 1, PixelData=bytes(3)), _Layout("BINARY", 3, 3, 3, 1), "a.dcm")
+        _FramePixels(header_with("BINARY", bits=1, PixelData=bytes(3)), layout, "a.dcm")
 
 
 TWO_RLE_FRAMES = encapsulate([bytes(66), bytes(66)])
@@ -89,17 +95,19 @@ TWO_RLE_FRAMES = encapsulate([bytes(66), bytes(66)])
 def test_compressed_frames_of_bits_or_of_another_number_than_stated_are_refused(bits, frames):
     data_set = header_with("BINARY", bits, RLELossless, PixelData=TWO_RLE_FRAMES)
     with pytest.raises(ValueError, match=f"compressed frames of {bits} bits|frame"):
-        _FramePixels(data_set, _Layout("BINARY", 3, 3, frames, bits), "a.dcm")
+        _FramePixels(data_set, layout_of("BINARY", rows=3, columns=3, frames=frames, bits=bits), "a.dcm")
 
 
 def test_compressed_frames_of_bytes_in_the_stated_number_are_accepted():
     data_set = header_with("BINARY", 8, RLELossless, PixelData=TWO_RLE_FRAMES)
-    assert len(_FramePixels(data_set, _Layout("BINARY", 3, 3, 2, 8), "a.dcm")._fragments) == 2
+    layout = layout_of("BINARY", rows=3, columns=3, frames=2, bits=8)
+    assert len(_FramePixels(data_set, layout, "a.dcm")._fragments) == 2
 
 
 def test_pixels_of_two_bytes_are_read_lowest_byte_first():
     data = struct.pack("<12H", *range(300, 312))
-    pixels = _FramePixels(header_with(bits=16, PixelData=data), _Layout("LABELMAP", 2, 3, 2, 16), "a.dcm")
+    layout = layout_of("LABELMAP", rows=2, columns=3, frames=2, bits=16)
+    pixels = _FramePixels(header_with(bits=16, PixelData=data), layout, "a.dcm")
     assert pixels.read(1).tolist() == [[306, 307, 308], [309, 310, 311]]
 
 

@@ -115,7 +115,8 @@ def test_percentiles_on_uneven_slices_are_weighted_by_thickness() -> None:
 
 def test_labels_measured_on_slices_of_other_places_than_their_own_are_warned_of() -> None:
     figures, _ = measure_on_uneven_slices()  # the map's own slices are evenly placed
-    assert "on its own" in figures.warnings[0]
+    (warning,) = figures.warnings
+    assert "on its own" in warning
 
 
 def test_map_of_half_the_voxel_size_is_measured_on_the_voxels_of_the_scan() -> None:
@@ -148,20 +149,23 @@ def test_label_that_leaves_the_scan_is_measured_inside_of_it_with_a_warning() ->
     rib, _ = measure_beside_scan()
     assert rib.voxels == 4 * 2 * 4
     assert rib.inside_share == pytest.approx(4 / 6)
-    assert rib.warnings[0].startswith("66.7 % of rib lie inside")
+    of_place, _ = rib.warnings
+    assert of_place.startswith("66.7 % of rib lie inside")
 
 
 def test_voxels_without_a_value_are_counted_and_left_out_of_the_mean() -> None:
     rib, _ = measure_beside_scan()
     assert (rib.unmeasured, rib.mean_hu) == (1, 0.0)
-    assert "1 of 32 voxels" in rib.warnings[1]
+    _, of_voxels = rib.warnings
+    assert "1 of 32 voxels" in of_voxels
 
 
 def test_label_outside_of_the_scan_has_no_figures_and_a_warning() -> None:
     _, beyond = measure_beside_scan()
     assert (beyond.voxels, beyond.ml, beyond.mean_hu, beyond.percentiles_hu["50"]) == (0, 0.0, None, None)
-    assert "has no voxel in the scan" in beyond.warnings[0]
-    assert "outside" in beyond.warnings[0]
+    (warning,) = beyond.warnings
+    assert "has no voxel in the scan" in warning
+    assert "outside" in warning
 
 
 def test_label_asked_for_by_name_and_number_is_measured_once_and_alone() -> None:

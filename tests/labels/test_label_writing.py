@@ -31,6 +31,7 @@ def make_labels_on(volume, numbers=(0, 0, 2, 5, 300)):
 
 
 def write_segmentation(path, labels, scan):
+    """Write labels as a DICOM SEG of the slices of a scan."""
     path.write_bytes(encode_segmentation(labels, list_slices(scan, Selection())))
     return path
 
@@ -128,7 +129,8 @@ def test_each_frame_of_a_written_segmentation_lies_on_the_slice_that_it_referenc
     slices = read_slices(scan)
     assert segmentation.NumberOfFrames == len(segmentation.PerFrameFunctionalGroupsSequence) > 0
     for group in segmentation.PerFrameFunctionalGroupsSequence:
-        k = group.FrameContentSequence[0].DimensionIndexValues[1] - 1  # segment and slice, both counted from 1
+        _, slice_number = group.FrameContentSequence[0].DimensionIndexValues  # segment and slice, both counted from 1
+        k = slice_number - 1
         (source,) = group.DerivationImageSequence[0].SourceImageSequence
         assert source.ReferencedSOPInstanceUID == slices[k].SOPInstanceUID
         position = np.array(group.PlanePositionSequence[0].ImagePositionPatient, float)
@@ -168,7 +170,7 @@ def test_segmentation_of_7_slices_is_not_written_for_6(scan):
 def test_segmentation_is_not_written_for_a_slice_without_a_study(scan):
     labels = make_labels_on(read_volume(scan))
     slices = list_slices(scan, Selection())
-    path = slices[2][0]
+    path, _, _ = slices[2]  # any
     dataset = pydicom.dcmread(path)
     del dataset.StudyInstanceUID
     dataset.save_as(path)

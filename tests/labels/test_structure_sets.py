@@ -35,6 +35,7 @@ PLANS = {
 
 @pytest.fixture(params=PLANS)
 def volume(request, tmp_path):
+    """A CT of 7 slices of 20 rows and 24 columns, 1.25 mm apart: one after the other of PLANS."""
     dicom_series.write_series(tmp_path / "ct", PLANS[request.param])
     return read_volume(tmp_path / "ct")
 
@@ -158,14 +159,16 @@ def test_contour_within_two_that_cross_is_a_hole_of_both(volume, tmp_path):
 
 def test_pixels_that_two_xor_contours_share_are_left_out(volume, tmp_path):
     xor = "CLOSEDPLANAR_XOR"
-    plus = [(xor, rectangle(volume, 2, *part)[1]) for part in (((5, 1), (7, 15)), ((1, 5), (18, 8)))]
+    (_, upright), (_, across) = rectangle(volume, 2, (5, 1), (7, 15)), rectangle(volume, 2, (1, 5), (18, 8))
+    plus = [(xor, upright), (xor, across)]
     labels = read_labels(write_structures(tmp_path / "rt.dcm", {"x": plus}), volume=volume)
     assert labels.counts == {1: 3 * 15 + 18 * 4 - 2 * 3 * 4}
     assert labels.warnings == ()
 
 
 def test_xor_contour_written_twice_leaves_nothing(volume, tmp_path):
-    twice = ("CLOSEDPLANAR_XOR", rectangle(volume, 2, (5, 1), (7, 15))[1])
+    _, points = rectangle(volume, 2, (5, 1), (7, 15))
+    twice = ("CLOSEDPLANAR_XOR", points)
     rois = {"y": [twice, twice, rectangle(volume, 4, (1, 1), (2, 2))]}
     labels = read_labels(write_structures(tmp_path / "rt.dcm", rois), volume=volume)
     assert labels.counts == {1: 2 * 2}
@@ -447,13 +450,14 @@ def test_command_stats_measures_the_rois_of_a_structure_set(scan_with_structure_
 
 
 def circle(radius, corners=40, centre=(20.0, 20.0)):
+    """Corners (n, 2) of a polygon on a circle."""
     turns = np.arange(corners) * 2.0 * np.pi / corners
     return np.stack((np.cos(turns), np.sin(turns)), axis=1) * radius + centre
 
 
 @pytest.mark.parametrize(
     "copy",
-    [circle(15.0, centre=(20.1, 20.0)), circle(15.0, centre=(20.001, 20.0)), circle(15.0, 80), circle(14.9)],
+    [circle(15.0, centre=(20.1, 20.0)), circle(15.0, centre=(20.001, 20.0)), circle(15.0, corners=80), circle(14.9)],
     ids=["a tenth of a voxel aside", "a thousandth", "twice the corners", "a little smaller"],
 )
 @pytest.mark.parametrize("copy_is_first", [False, True])

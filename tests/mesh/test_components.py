@@ -315,7 +315,7 @@ def test_equal_components_are_in_the_order_of_the_mesh_wherever_they_lie(reach_m
     centres = np.random.default_rng(seed).uniform(-reach_mm, reach_mm, (4, 3))
     if reach_mm > 4096:  # float64 vertices were computed in float32 from a point near their centre
         centres = centres[0] + centres / 100
-    vertices, triangles = samples.sphere((0, 0, 0), 7.3, 3)
+    vertices, triangles = samples.sphere((0, 0, 0), radius=7.3, rounds=3)
     mesh = Mesh(*samples.join(*[((vertices + centre).astype(np.float64), triangles) for centre in centres]))
 
     pieces = split_components(mesh)
@@ -328,7 +328,7 @@ def test_equal_components_are_in_the_order_of_the_mesh_wherever_they_lie(reach_m
 
 def test_components_that_differ_by_more_than_rounding_are_in_the_order_of_size():
     """Areas grow by a hundredth of a per mille, 400 mm from the origin; the order is no chain of equal neighbours."""
-    vertices, triangles = samples.sphere((400, 0, 0), 10.0, 3)
+    vertices, triangles = samples.sphere((400, 0, 0), radius=10.0, rounds=3)
     scales = 1.0 + 5e-6 * np.arange(40)
     mesh = Mesh(*samples.join(*[(vertices * scale, triangles) for scale in scales]))
     kept = select_components(mesh, keep_largest=1)

@@ -38,7 +38,8 @@ def test_fans_begin_where_those_of_the_vertices_before_end(fans_of_three_triangl
 @pytest.fixture
 def torus_triangles():
     """Triangles between 96 vertices."""
-    return samples.torus(12, 8)[1].astype(np.uint32)
+    _, triangles = samples.torus(rings=12, sides=8)
+    return triangles.astype(np.uint32)
 
 
 def test_triangles_that_touch_some_vertices_are_those_that_name_one_of_them(torus_triangles):

@@ -12,6 +12,8 @@ from clrecon.cli.main import main
 
 AFFINE = np.array([[0.8, 0.1, 0.0, -20.0], [-0.1, 0.8, 0.0, 30.0], [0.0, 0.0, 1.0, 100.0], [0.0, 0.0, 0.0, 1.0]])
 BAND = "200,3000"
+LARGE_BALL_LPS, SMALL_BALL_LPS = AFFINE[:3] @ (15, 16, 14, 1), AFFINE[:3] @ (34, 16, 26, 1)
+"""Centres in mm; the surfaces at 200 HU have radii of 9.3 and 5.2 voxels, of 0.8 to 1 mm."""
 
 
 def make_voxels() -> np.ndarray:

@@ -20,6 +20,7 @@ URL = "dicomweb+https://pacs.example/studies/1.2/series/3.4"
 
 
 def read_table(folder: Path, *rows: str, columns: str = "case,input") -> list[Case]:
+    """Read the cases of a manifest with these lines."""
     (folder / "m.csv").write_text("\n".join([columns, *rows]))
     return read_cases(folder / "m.csv", ScanSettings())
 
@@ -41,7 +42,7 @@ WRONG_ROWS = {
 def test_wrong_url_of_a_manifest_is_refused_with_its_line_and_no_password(what: str, tmp_path: Path) -> None:
     columns, row = WRONG_ROWS[what]
 
-    with refused(UsageError, 2, "m.csv") as caught:
+    with refused(UsageError, 2, "m.csv") as caught:  # line 2, below the columns
         read_table(tmp_path, row, columns=columns)
 
     assert "sesame" not in str(caught.value)
@@ -52,14 +53,18 @@ def test_manifest_behind_a_url_is_refused() -> None:
         read_cases("s3://bucket/cohort.csv", ScanSettings())
 
 
+def case_of(url: str, name: str = "a") -> Case:
+    return Case(name, source=url, series=None, labels=None)
+
+
 def test_url_lies_in_no_folder_of_the_output_but_a_path_of_its_words_does(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
 
-    check_places([Case("url", "s3://scans/p", None, None)], tmp_path)
+    check_places([case_of("s3://scans/p")], tmp_path)
     with refused(UsageError, "path"):
-        check_places([Case("path", "s3:/scans/p", None, None)], tmp_path)
+        check_places([case_of("s3:/scans/p", name="path")], tmp_path)
 
 
 @pytest.fixture
@@ -77,17 +82,18 @@ def plan_of(folder: Path, *, resume: bool = False) -> Plan:
 
 
 def test_key_of_a_case_changes_with_the_instances_of_its_archive(archive: Archive, tmp_path: Path) -> None:
-    case, plan = Case("a", archive.url, None, None), plan_of(tmp_path)
+    case, plan = case_of(archive.url), plan_of(tmp_path)
 
-    keys = [make_key(case, plan), make_key(case, plan)]
+    first, again = make_key(case, plan), make_key(case, plan)
     archive.uids[0] += ".1"
-    keys.append(make_key(case, plan))
+    with_another_instance = make_key(case, plan)
 
-    assert keys[0] == keys[1] != keys[2]
+    assert first == again != with_another_instance
 
 
 def make_once(archive: Archive, folder: Path) -> Case:
-    case = Case("a", archive.url, None, None)
+    """Make the case of the archive, and forget what was asked for it."""
+    case = case_of(archive.url)
     assert make_case(case, plan_of(folder)) == Answer("done")
     archive.asked.clear()
     return case
@@ -97,7 +103,9 @@ def test_finished_case_is_kept_without_fetching_its_scan_again(archive: Archive,
     case = make_once(archive, tmp_path)
 
     assert make_case(case, plan_of(tmp_path, resume=True)) == Answer("done", kept=True)
-    assert all("instances" in path for path, _ in archive.asked)
+    assert {path.split("?")[0].rsplit("/", 1)[1] for path, _ in archive.asked} == {
+        "instances"
+    }  # their list, none alone
 
 
 def test_finished_case_is_kept_and_named_where_its_server_is_gone(archive: Archive, tmp_path: Path) -> None:
@@ -114,7 +122,7 @@ def test_finished_case_is_kept_and_named_where_its_server_is_gone(archive: Archi
 def test_case_whose_server_is_gone_fails_and_is_not_refused(archive: Archive, tmp_path: Path) -> None:
     archive.close()
 
-    answer = make_case(Case("a", archive.url, None, None), plan_of(tmp_path))
+    answer = make_case(case_of(archive.url), plan_of(tmp_path))
 
     assert answer.status == "failed"
     assert archive.host in answer.error

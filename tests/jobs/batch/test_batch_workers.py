@@ -25,7 +25,12 @@ pytestmark = [
 COMMAND = [sys.executable, "-m", "clrecon", "batch", "--no-picture"]
 
 
-def write_ball(folder: Path, size: int) -> None:
+SOME_CASES_NOT_DONE, DISK_FULL, INTERRUPTED = 8, 6, 130
+"""Exit codes, see docs/contract.md."""
+
+
+def write_ball(folder: Path, *, size: int) -> None:
+    """Write a CT of a ball in `size` x `size` pixels and half as many slices."""
     settings = PhantomSettings(
         kind="sphere", size=(size, size), slices=size // 2, spacing=(0.5, 0.5, 0.5), radius_mm=size / 12, noise=0.0
     )
@@ -40,13 +45,13 @@ def write_manifest(folder: Path, inputs: Mapping[str, str]) -> None:
 @pytest.fixture
 def small_cases(tmp_path: Path) -> list[str]:
     """Names of so many small cases that none of these tests meets the last one."""
-    write_ball(tmp_path / "small", 24)
+    write_ball(tmp_path / "small", size=24)
     names = [f"case{number}" for number in range(12)]
     write_manifest(tmp_path, dict.fromkeys(names, "small"))
     return names
 
 
-def start(folder: Path, *options: str, prepare: Callable[[], None] | None = None) -> subprocess.Popen[str]:
+def start_batch(folder: Path, *options: str, prepare: Callable[[], None] | None = None) -> subprocess.Popen[str]:
     return subprocess.Popen(
         [*COMMAND, str(folder / "m.csv"), "-o", str(folder / "out"), "--hu", "300", *options],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=prepare,
@@ -61,14 +66,14 @@ def statuses(folder: Path) -> dict[str, str]:
 def test_case_of_a_killed_worker_is_lost_alone_and_named_with_the_signal_and_resume_makes_it(
     tmp_path: Path, small_cases: list[str]
 ) -> None:
-    process = start(tmp_path)
+    process = start_batch(tmp_path)
     first_case = tmp_path / "out" / small_cases[0]
     wait_until(process, first_case.exists)  # no kernel is built any more, whose file could be cut
     (worker,) = children_of(process.pid)
     os.kill(worker, signal.SIGKILL)
     _, errors = process.communicate(timeout=240)
 
-    assert process.returncode == 8
+    assert process.returncode == SOME_CASES_NOT_DONE
     found = statuses(tmp_path)
     (lost,) = (case for case, status in found.items() if status == "lost")
     assert found == dict.fromkeys(small_cases, "done") | {lost: "lost"}
@@ -76,17 +81,17 @@ def test_case_of_a_killed_worker_is_lost_alone_and_named_with_the_signal_and_res
     report = json.loads((tmp_path / "out" / lost / "case.json").read_text())
     assert "SIGKILL" in report["error"]["message"]
 
-    again = start(tmp_path, "--resume", "--json")
+    again = start_batch(tmp_path, "--resume", "--json")
     resumed = json.loads(again.communicate(timeout=240)[0])
     assert again.returncode == 0
     assert (resumed["made"], resumed["kept"]) == (1, len(small_cases) - 1)
 
 
 def test_case_of_a_killed_worker_among_several_is_made_again_alone(tmp_path: Path) -> None:
-    write_ball(tmp_path / "small", 24)
+    write_ball(tmp_path / "small", size=24)
     cases = ("first", "second", "third")
     write_manifest(tmp_path, dict.fromkeys(cases, "small"))
-    process = start(tmp_path, "--workers", "2")
+    process = start_batch(tmp_path, "--workers", "2")
     wait_until(process, lambda: len(children_of(process.pid)) == 2)  # each has been given a case, and still starts
     for worker in children_of(process.pid):
         os.kill(worker, signal.SIGKILL)
@@ -96,11 +101,11 @@ def test_case_of_a_killed_worker_among_several_is_made_again_alone(tmp_path: Pat
 
 
 def test_interrupted_batch_ends_with_130_and_leaves_only_whole_cases(tmp_path: Path, small_cases: list[str]) -> None:
-    process = start(tmp_path)
+    process = start_batch(tmp_path)
     wait_until(process, (tmp_path / "out" / small_cases[0]).exists)
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=60)
-    assert process.returncode == 130 and "Traceback" not in errors
+    assert process.returncode == INTERRUPTED and "Traceback" not in errors
     left = sorted((tmp_path / "out").iterdir(), key=lambda folder: small_cases.index(folder.name))
     assert [folder.name for folder in left] == small_cases[: len(left)] and len(left) < len(small_cases)
     assert all((folder / "mesh.stl").is_file() and (folder / "case.json").is_file() for folder in left)
@@ -111,9 +116,9 @@ def test_kernels_that_a_worker_has_built_are_on_record_when_it_has_ended(
 ) -> None:
     kernels = tmp_path / "clrecon"
     monkeypatch.setenv("POCL_CACHE_DIR", str(kernels))
-    write_ball(tmp_path / "small", 24)
+    write_ball(tmp_path / "small", size=24)
     write_manifest(tmp_path, {"only": "small"})
-    process = start(tmp_path, "--no-measure")
+    process = start_batch(tmp_path, "--no-measure")
     _, errors = process.communicate(timeout=240)
     assert process.returncode == 0, errors
     if not list(kernels.glob("??/*")):
@@ -126,16 +131,16 @@ def test_kernels_that_a_worker_has_built_are_on_record_when_it_has_ended(
 def test_batch_on_a_full_disk_ends_with_6_and_resumes_when_there_is_room(tmp_path: Path) -> None:
     import resource
 
-    write_ball(tmp_path / "small", 24)
-    write_ball(tmp_path / "large", 256)
+    write_ball(tmp_path / "small", size=24)
+    write_ball(tmp_path / "large", size=256)
     write_manifest(tmp_path, {"first": "small", "second": "large", "third": "small"})
     limit = (1_500_000, 1_500_000)  # bytes of a file: built kernels and a small mesh fit, the large mesh does not
-    process = start(tmp_path, prepare=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, limit))
+    process = start_batch(tmp_path, prepare=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, limit))
     _, errors = process.communicate(timeout=240)
-    assert process.returncode == 6, errors
+    assert process.returncode == DISK_FULL, errors
     assert len(errors.splitlines()) == 1 and "second" in errors
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["first"]
-    again = start(tmp_path, "--resume", "--json")
+    again = start_batch(tmp_path, "--resume", "--json")
     output, _ = again.communicate(timeout=240)
     assert again.returncode == 0
     assert (json.loads(output)["made"], json.loads(output)["kept"]) == (2, 1)

@@ -24,6 +24,7 @@ pytestmark = pytest.mark.first_device
 
 @pytest.fixture(scope="module")
 def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two balls, a plate, and lone voxels; see `make_voxels`."""
     path = tmp_path_factory.mktemp("cloud") / "scan.nrrd"
     write_nrrd(path, make_voxels(), AFFINE)
     return path
@@ -145,6 +146,7 @@ def test_clustering_that_takes_more_than_half_of_the_points_is_done_with_a_warni
 def test_clustering_that_takes_too_much_is_refused_from_python_with_the_parameter(
     noisy_scan: Path, device: Any, tmp_path: Path
 ) -> None:
-    settings = CloudSettings(hu=(200, 3000), clusters=Clustering(1.5, 5), device=str(device.index))
+    clusters = Clustering(eps=1.5, min_samples=5)
+    settings = CloudSettings(hu=(200, 3000), clusters=clusters, device=str(device.index))
     with refused(RefusedInputError, "allow_point_loss=True"):
         make_cloud(noisy_scan, CloudFiles(tmp_path / "b.ply"), settings)

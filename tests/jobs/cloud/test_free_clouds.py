@@ -15,17 +15,17 @@ import clrecon
 pytestmark = pytest.mark.first_device
 
 
-def write_ball(path: Path, radius: float) -> Path:
+def write_ball(path: Path, *, radius_mm: float = 10.0) -> Path:
     """Write 3000 points on a ball."""
     directions = np.random.default_rng(4).normal(size=(3000, 3))
-    np.savetxt(path, radius * directions / np.linalg.norm(directions, axis=1, keepdims=True), "%.9f")
+    np.savetxt(path, radius_mm * directions / np.linalg.norm(directions, axis=1, keepdims=True), "%.9f")
     return path
 
 
 def test_surface_of_a_free_cloud_is_refused_without_normals_and_a_viewpoint(
     tmp_path: Path, cloud_command: Any, printed: Printer
 ) -> None:
-    source, surface = write_ball(tmp_path / "free.xyz", 10.0), ["--surface", str(tmp_path / "out.stl")]
+    source, surface = write_ball(tmp_path / "free.xyz"), ["--surface", str(tmp_path / "out.stl")]
     assert cloud_command(source, *surface) == 3
     printed().assert_error("--normals", "--viewpoint")
     assert cloud_command(source, "--normals", *surface) == 3
@@ -33,11 +33,11 @@ def test_surface_of_a_free_cloud_is_refused_without_normals_and_a_viewpoint(
     assert {path.name for path in tmp_path.iterdir()} == {"free.xyz"}
 
 
-@pytest.mark.parametrize(("radius", "unit"), [(0.05, "metres"), (50.0, ""), (50_000.0, "micrometres")])
+@pytest.mark.parametrize(("radius_mm", "unit"), [(0.05, "metres"), (50.0, ""), (50_000.0, "micrometres")])
 def test_cloud_of_implausible_size_is_warned_of_with_the_unit_it_may_be_in(
-    radius: float, unit: str, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
+    radius_mm: float, unit: str, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert cloud_command(write_ball(tmp_path / "free.xyz", radius)) == 0
+    assert cloud_command(write_ball(tmp_path / "free.xyz", radius_mm=radius_mm)) == 0
     error = capsys.readouterr().err
     assert (f"which is read as mm; perhaps they are in {unit}: then" in error) == bool(unit)
     assert error.count("\n") == bool(unit)
@@ -46,7 +46,7 @@ def test_cloud_of_implausible_size_is_warned_of_with_the_unit_it_may_be_in(
 def test_bilateral_filter_of_the_paper_moves_points_otherwise_than_the_default(
     tmp_path: Path, cloud_command: Any
 ) -> None:
-    source = write_ball(tmp_path / "free.xyz", 10.0)
+    source = write_ball(tmp_path / "free.xyz")
     assert cloud_command(source, "--denoise", "bilateral", "--paper", output="a.ply") == 0
     assert cloud_command(source, "--denoise", "bilateral", output="b.ply") == 0
     one, two = (clrecon.read_points(tmp_path / name).points for name in ("a.ply", "b.ply"))
@@ -63,7 +63,7 @@ def test_cloud_in_a_format_that_is_not_read_is_refused_with_its_extension(
 
 
 def test_cloud_of_numbers_with_the_extension_asc_is_read(tmp_path: Path, cloud_command: Any) -> None:
-    source = write_ball(tmp_path / "free.xyz", 10.0).rename(tmp_path / "free.asc")
+    source = write_ball(tmp_path / "free.xyz").rename(tmp_path / "free.asc")
     assert cloud_command(source, output="a.ply") == 0
     assert len(clrecon.read_points(tmp_path / "a.ply")) == len(clrecon.read_points(source))
 

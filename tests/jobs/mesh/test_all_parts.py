@@ -20,7 +20,6 @@ from clrecon.jobs.mesh.settings import MeshSettings
 
 RADII_MM = (13.0, 10.0, 8.0)
 CAVITY_MM = 3.0
-CAVITY = 3.0
 
 
 def ball(shape, centre, radius):

@@ -18,12 +18,13 @@ from clrecon.system.records import none_of
 
 AFFINE = np.diag((1.0, 1.0, 1.5, 1.0))
 HEART_RADIUS_MM, BONE_RADIUS_MM = 12, 9
+HEART_HU, BONE_HU = 380.0, 900.0
 HEART_ML, BONE_ML = 4 / 3 * np.pi * HEART_RADIUS_MM**3 / 1000, 4 / 3 * np.pi * BONE_RADIUS_MM**3 / 1000
 FLAT_SHARE = 0.05
 """Of the contrast: where more of it ends in flat plateaus a scan is taken to have contrast medium."""
 
 
-def make_scan(heart: float = 380.0, bone: float = 900.0) -> Volume:
+def make_scan(*, heart: float = HEART_HU, bone: float = BONE_HU) -> Volume:
     """A heart larger than a bone with marrow, in tissue of 40 HU, in air; 0 HU leaves one out."""
     from scipy.ndimage import gaussian_filter
 
@@ -65,6 +66,7 @@ def test_largest_component_that_is_a_heart_is_warned_of(level: Any, set_scan: An
     assert report["volume_ml"] == pytest.approx(HEART_ML, rel=0.15)  # 200 HU lies near half way from 40 to 380 HU
     assert report["walls"]["looks_like"] == "contrast medium"
     (warning,) = warnings_with("what is kept looks like contrast medium", report)
+    assert HEART_HU < 600  # the HU of compact bone
     assert "reach 600 at 0.0 %; keep='bone'" in warning
 
 
@@ -190,7 +192,7 @@ def test_component_about_the_spinal_canal_is_kept_as_bone_where_no_wall_is_dense
     from clrecon.anatomy import spine_line
 
     through_the_bone = np.array([[15.0, 21.0, 30.0], [15.0, 21.0, 6.0]])  # mm
-    line = spine_line.SpineLine(through_the_bone, 1.0, 36.0, (30.0, 6.0))
+    line = spine_line.SpineLine(points=through_the_bone, sure_share=1.0, searched_mm=36.0, sure_mm=(30.0, 6.0))
     monkeypatch.setattr(spine_line, "find_spine_line", lambda volume, sure_only: line)
     set_scan(make_scan(bone=330.0))
 

@@ -22,44 +22,46 @@ from clrecon.jobs.mesh.surfaces import choose_level, describe_level, plan_surfac
 from clrecon.jobs.preprocess import mask_volume
 from clrecon.system.progress import ignore_progress
 
+TISSUE_HU, BONE_HU = 40.0, 1040.0
 
-def ball(bone: float = 1040.0, tissue: float = 40.0) -> Volume:
+
+def ball(bone: float = BONE_HU) -> Volume:
     """A ball of bone of 10 mm in soft tissue, in HU, its edge blurred over 3 mm."""
     distance = np.linalg.norm(np.indices((36, 36, 36)).reshape(3, -1).T - (17.7, 17.4, 18.1), axis=1) - 10.0
-    field = tissue + (bone - tissue) * np.clip(0.5 - distance / 3.0, 0.0, 1.0).reshape(36, 36, 36)
+    field = TISSUE_HU + (bone - TISSUE_HU) * np.clip(0.5 - distance / 3.0, 0.0, 1.0).reshape(36, 36, 36)
     voxels = np.rint(field).astype(np.int16)
     return Volume(voxels, np.eye(4))
 
 
 @pytest.fixture
-def scan(monkeypatch: pytest.MonkeyPatch) -> list[Volume]:
-    """What the job reads: the one entry of this list."""
+def scan_of_a_ball(monkeypatch: pytest.MonkeyPatch) -> list[Volume]:
+    """What the job reads: the one entry of this list, at first `ball()`."""
     volumes = [ball()]
     monkeypatch.setattr("clrecon.reading.dicom.reader.read_series", lambda source, selection, progress: volumes[0])
     return volumes
 
 
 def mesh_scan(tmp_path: Path, device: Any, **settings: Any) -> dict[str, Any]:
-    """Mesh what `scan` gives to b.ply and b.json; return the report."""
+    """Mesh what `scan_of_a_ball` gives to b.ply and b.json; return the report."""
     return make_mesh(
         "scan", tmp_path / "b.ply", MeshSettings(device=str(device.index), **settings), report_path=tmp_path / "b.json"
     )
 
 
-@pytest.mark.usefixtures("scan")
+@pytest.mark.usefixtures("scan_of_a_ball")
 def test_auto_chooses_the_iso_value_half_way_between_the_medians_of_tissue_and_bone(
     device: Any, tmp_path: Path
 ) -> None:
     report = mesh_scan(tmp_path, device, half_way="auto")
 
-    half_way, step = (1040.0 + 40.0) / 2, 1040.0 - 40.0
+    half_way, step = (BONE_HU + TISSUE_HU) / 2, BONE_HU - TISSUE_HU
     assert abs(report["iso_value_hu"] - half_way) <= tolerances.HALF_WAY_STEP_SHARE * step
     choice = report["iso_value_choice"]
-    assert (choice["method"], choice["bone_hu"], choice["tissue_hu"]) == ("auto", 1040.0, 40.0)
+    assert (choice["method"], choice["bone_hu"], choice["tissue_hu"]) == ("auto", BONE_HU, TISSUE_HU)
     assert report["iso_value_reason"].startswith("half way between tissue 40 and bone 1040 HU, medians of ")
 
 
-@pytest.mark.usefixtures("scan")
+@pytest.mark.usefixtures("scan_of_a_ball")
 def test_written_report_of_auto_has_the_choice_and_its_time_and_no_preset(device: Any, tmp_path: Path) -> None:
     report = mesh_scan(tmp_path, device, half_way="auto")
 
@@ -69,7 +71,7 @@ def test_written_report_of_auto_has_the_choice_and_its_time_and_no_preset(device
     assert (written["preset"], written["meshes"][0]["name"]) == (None, None)
 
 
-@pytest.mark.usefixtures("scan")
+@pytest.mark.usefixtures("scan_of_a_ball")
 def test_mesh_of_auto_is_that_of_its_iso_value_given_as_a_number(device: Any, tmp_path: Path) -> None:
     automatic = mesh_scan(tmp_path, device, half_way="auto")
     mesh_of_auto = (tmp_path / "b.ply").read_bytes()
@@ -80,7 +82,7 @@ def test_mesh_of_auto_is_that_of_its_iso_value_given_as_a_number(device: Any, tm
     assert (given["iso_value_choice"], given["iso_value_reason"]) == (None, "as given")
 
 
-@pytest.mark.usefixtures("scan")
+@pytest.mark.usefixtures("scan_of_a_ball")
 def test_mesh_of_two_given_materials_has_the_iso_value_half_way_between_them(device: Any, tmp_path: Path) -> None:
     report = mesh_scan(tmp_path, device, half_way=(1000, 40), split=True)
 
@@ -92,9 +94,9 @@ def test_mesh_of_two_given_materials_has_the_iso_value_half_way_between_them(dev
 
 
 def test_auto_without_bone_in_the_scan_is_refused_and_writes_nothing(
-    scan: list[Volume], device: Any, tmp_path: Path
+    scan_of_a_ball: list[Volume], device: Any, tmp_path: Path
 ) -> None:
-    scan[0] = ball(bone=60.0)
+    scan_of_a_ball[0] = ball(bone=60.0)
 
     with refused(NoSurfaceError, "bone", "half_way"):
         mesh_scan(tmp_path, device, half_way="auto")
@@ -103,7 +105,8 @@ def test_auto_without_bone_in_the_scan_is_refused_and_writes_nothing(
 
 
 def test_given_bone_brighter_than_the_scan_is_warned_of() -> None:
-    entries, warnings = describe_level(ball(), MeshSettings(half_way=(1800, 40)), half_iso_value(1800, 40))
+    choice = half_iso_value(bone_hu=1800, tissue_hu=40)
+    entries, warnings = describe_level(ball(), MeshSettings(half_way=(1800, 40)), choice)
 
     assert entries["iso_value_choice"]["bone_hu"] == 1800
     (warning,) = warnings
@@ -120,7 +123,7 @@ def warn_of_auto_level(slice_spacing_mm: float) -> list[str]:
 def test_auto_in_slices_3_mm_apart_is_warned_of_with_its_iso_value() -> None:
     (warning,) = warn_of_auto_level(slice_spacing_mm=3.0)
     assert "slices are 3 mm apart" in warning
-    assert "540 HU" in warning
+    assert f"{(BONE_HU + TISSUE_HU) / 2:g} HU" in warning
 
 
 def test_auto_in_slices_2_mm_apart_has_no_warning() -> None:

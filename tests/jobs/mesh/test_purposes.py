@@ -93,6 +93,7 @@ def test_labels_that_are_seeds_alone_are_not_made_solid() -> None:
         ({"seeds": [(0.0, 0.0, 0.0)]}, None),
         ({"seeds": [(0.0, 0.0, 0.0)], "keep": "bone"}, "bone"),
     ],
+    ids=str,
 )
 def test_bone_is_kept_where_the_level_is_that_of_bone_and_nothing_else_is_chosen(given: Any, keep: str | None) -> None:
     assert MeshSettings(**settings_for("print", given)).keep == keep
@@ -268,6 +269,10 @@ def make_hip() -> Volume:
     return Volume(np.rint(np.minimum(hu, 3071)).astype(np.int16), np.diag([1.0, 1.0, 1.5, 1.0]))
 
 
+GATE_FAILED = 8
+"""The exit code, see docs/contract.md."""
+
+
 def print_phantom(device: Any, scan: Path, folder: Path, *options: str) -> tuple[int, dict[str, Any]]:
     """The exit code and the report of a print."""
     command = ["mesh", str(scan), "-o", str(folder / "a.stl"), "--for", "print", "-q", *options]
@@ -287,7 +292,7 @@ def test_gate_of_the_iso_distance_is_judged_without_what_is_near_metal_and_says_
     (gate,) = (gate for gate in report["gates"] if gate["name"] == "iso_distance_p95")
 
     assert code == 0
-    assert 0.2 < found["near_metal_share"] < 0.35
+    assert 0.2 < found["near_metal_share"] < 0.35  # a quarter, as the docstring says
     whole, away = found["vertices_voxel"]["p95"], found["away_from_metal_voxel"]["p95"]
     assert whole > gate["bound"] > 1.5 * away
     assert gate["measured"] == away
@@ -310,9 +315,12 @@ def coarse_hip(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_print_that_lies_too_far_is_decimated_again_within_a_tighter_bound(
     device: Any, coarse_hip: Path, tmp_path: Path
 ) -> None:
+    bound_mm = 0.25 * VOXEL_MM  # that of smoothing, and the first of decimation
+
     code, report = print_phantom(device, coarse_hip, tmp_path)
+
     assert code == 0
-    assert report["refinement"]["decimate"]["max_deviation_mm"] == pytest.approx(0.5 * 0.25 * VOXEL_MM)
+    assert report["refinement"]["decimate"]["max_deviation_mm"] == pytest.approx(bound_mm / 2)
 
 
 @pytest.mark.seconds
@@ -321,7 +329,7 @@ def test_print_with_a_bound_of_its_own_that_lies_too_far_fails_its_gates(
 ) -> None:
     bound_mm = 0.25 * VOXEL_MM  # that of smoothing alone
     code, report = print_phantom(device, coarse_hip, tmp_path, "--max-deviation", f"{bound_mm}")
-    assert code == 8
+    assert code == GATE_FAILED
     assert report["refinement"]["decimate"]["max_deviation_mm"] == bound_mm
     failed = {gate["name"] for gate in report["gates"] if gate["ok"] is False}
-    assert failed <= {"iso_distance_p95", "iso_distance_mean"}
+    assert failed and failed <= {"iso_distance_p95", "iso_distance_mean"}

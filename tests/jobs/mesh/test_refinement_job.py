@@ -24,6 +24,7 @@ SPACING = (0.5, 0.7, 1.0)
 
 @pytest.fixture(scope="module")
 def noisy_torus(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """The folder of a CT of a torus in voxels of SPACING, and its truth with the iso value of its surface."""
     folder = tmp_path_factory.mktemp("refine") / "ct"
     settings = PhantomSettings(kind="torus", size=(72, 56), slices=31, spacing=SPACING, tilt=15.0, noise=30.0)
     return folder, write_phantom(folder, settings)
@@ -97,10 +98,11 @@ def test_report_of_a_mesh_has_the_distance_of_its_vertices_and_triangles_from_th
 def test_open_surface_passes_its_gates_with_vertices_on_the_iso_surface(
     device: Any, noisy_torus: Any, tmp_path: Path
 ) -> None:
+    folder, _ = noisy_torus
     in_noise_of_air = -990.0  # the surface is cut open where the scan ends
     settings = MeshSettings(iso_value=in_noise_of_air, closed=False, device=str(device.index))
 
-    report = make_mesh(noisy_torus[0], tmp_path / "a.stl", settings, measure=True)
+    report = make_mesh(folder, tmp_path / "a.stl", settings, measure=True)
 
     assert not report["closed"]
     assert failed_gates(report) == []
@@ -110,11 +112,8 @@ def test_open_surface_passes_its_gates_with_vertices_on_the_iso_surface(
 def test_refined_mesh_is_smoothed_then_decimated_then_compared(refined: RefinedTorus) -> None:
     in_order = list(dict.fromkeys(refined.stages))
 
-    assert [stage for stage in in_order if stage in ("smooth", "decimate", "compare")] == [
-        "smooth",
-        "decimate",
-        "compare",
-    ]
+    expected = ["smooth", "decimate", "compare"]
+    assert [stage for stage in in_order if stage in expected] == expected
 
 
 def test_report_of_a_refined_mesh_is_written_beside_it(refined: RefinedTorus) -> None:
@@ -250,13 +249,14 @@ def test_strict_writes_the_same_mesh_with_exit_code_8_and_a_line_for_each_failed
 def test_strict_command_with_a_good_mesh_ends_with_0_and_names_no_gate(
     device: Any, noisy_torus: Any, tmp_path: Path, printed: Printer
 ) -> None:
-    level = f"{noisy_torus[1]['iso_value_hu']:g}"
-    arguments = ["mesh", str(noisy_torus[0]), "-o", str(tmp_path / "a.stl"), "--hu", level, "--keep-largest", "1"]
+    folder, truth = noisy_torus
+    level = f"{truth['iso_value_hu']:g}"
+    arguments = ["mesh", str(folder), "-o", str(tmp_path / "a.stl"), "--hu", level, "--keep-largest", "1"]
 
     assert main([*arguments, "--device", str(device.index), "--smooth", "--strict"]) == 0
 
     said = printed()
-    said.assert_output("smoothed", 20)  # iterations
+    said.assert_output("smoothed", 20)  # iterations of --smooth without a number
     assert "gate" not in said.everything
 
 

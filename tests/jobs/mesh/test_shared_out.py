@@ -47,7 +47,12 @@ def make_noise(dtype: Any = np.int16, **place: Any) -> Volume:
     return Volume((waves + noise).astype(dtype), AFFINE, **place)
 
 
+SPANS = 5
+"""Of the 40 slices: 8 each, as few as a span gets."""
+
+
 def uneven_places() -> dict[str, Any]:
+    """Keywords of a volume whose slices lie up to 0.3 of a step off even ones."""
     steps = np.arange(SLICES) + 0.3 * np.sin(np.arange(SLICES))
     return {"slice_positions": AFFINE[:3, 3] + steps[:, None] * AFFINE[:3, 2]}
 
@@ -70,12 +75,12 @@ def by_sent_spans(volume: Volume, level: Any, device: Device, **how: Any) -> Mes
     def make_spans(grid: SampleGrid, spans: Sequence[Span]) -> Iterator[tuple[Span, SpanPart]]:
         positions = volume.slice_origins() if volume.uneven else None
         facts = GridFacts(volume.voxels.shape, volume.affine, positions, grid.rule)
-        assert len(spans) == 5  # of 8 slices and more, as small as spans get
+        assert len(spans) == SPANS
         for span in reversed(spans):
             yield span, make_sent_span(cut_voxels(grid, span), facts, device, None)
 
     with DeviceVolume(volume, device=device) as resident:
-        return extract_by_spans(resident, level, make_spans, 5, **{"closed": True, "below": False} | how)
+        return extract_by_spans(resident, level, make_spans, SPANS, **{"closed": True, "below": False} | how)
 
 
 def assert_same_arrays(mesh: Mesh, expected: Mesh) -> None:
@@ -93,15 +98,17 @@ def test_surface_from_sent_spans_has_the_arrays_of_one_extraction(case: str, dev
 
 
 def test_surface_that_no_span_has_is_refused_like_that_of_one_extraction(device: Device) -> None:
-    with refused(NoSurfaceError, 5000):
-        by_sent_spans(make_noise(), 5000, device)
+    above_all_values = 5000
+
+    with refused(NoSurfaceError, above_all_values):
+        by_sent_spans(make_noise(), above_all_values, device)
 
 
 def test_surface_on_all_devices_has_the_arrays_of_one(device: Device) -> None:
     volume = make_noise()
     devices = [own for own in list_devices() if not (own.is_simulator or own.shortcoming)]
     with DeviceVolume(volume, device=device) as resident:
-        mesh = extract_by_spans(resident, 100, DeviceSpans(devices, None), 5, closed=True, below=False)
+        mesh = extract_by_spans(resident, 100, DeviceSpans(devices, None), SPANS, closed=True, below=False)
     assert_same_arrays(mesh, extract_isosurface(volume, 100, device=device))
     assert all(own.driver in mesh.report["driver"] for own in devices)  # each has begun with a span
 
@@ -135,6 +142,6 @@ def test_surface_of_workers_has_the_arrays_of_one_extraction_when_a_worker_is_ki
                     os.kill(killed[0], signal.SIGKILL)
                 yield made
 
-        mesh = extract_by_spans(resident, 100, make_spans, 5, closed=True, below=False)
+        mesh = extract_by_spans(resident, 100, make_spans, SPANS, closed=True, below=False)
         assert [*cluster.call_all(os.getpid)] != killed  # another one has come
     assert_same_arrays(mesh, extract_isosurface(volume, 100, device=device))

@@ -23,11 +23,13 @@ from clrecon.reading.dicomweb import Store
 
 @pytest.fixture(scope="module")
 def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A DICOM series of a ball, of the patient PATIENT."""
     return write_series(tmp_path_factory.mktemp("scan"))
 
 
 @pytest.fixture
 def archive(scan: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Archive]:
+    """A server that has the scan, and keeps what is stored; no test waits before it asks again."""
     monkeypatch.setenv("NETRC", "")
     monkeypatch.setattr("time.sleep", lambda seconds: None)
     with running(Archive(scan)) as server:
@@ -35,6 +37,7 @@ def archive(scan: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Archive]:
 
 
 def store(scan: Path, folder: Path, url: str, *options: str) -> int:
+    """Mesh a scan to b.stl and store it at a URL; return the exit code."""
     return main(["mesh", str(scan), "-o", str(folder / "b.stl"), "--hu", "0", "-q", "--store", url, *options])
 
 
@@ -58,7 +61,8 @@ def test_stored_mesh_is_the_file_with_the_patient_the_study_and_the_slices_of_th
 def test_mesh_in_another_frame_is_stored_in_that_of_the_scan(archive: Archive, scan: Path, tmp_path: Path) -> None:
     assert store(scan, tmp_path, archive.study, "--space", "ras") == 0
 
-    assert archive.stored()[0].EncapsulatedDocument[:80].startswith(b"clrecon SPACE=LPS")
+    (model,) = archive.stored()
+    assert model.EncapsulatedDocument.startswith(b"clrecon SPACE=LPS")  # the header of the STL
 
 
 @pytest.mark.parametrize(
@@ -126,9 +130,11 @@ def test_scan_that_is_no_dicom_cannot_be_stored(archive: Archive, scan: Path, tm
 def test_same_mesh_of_the_same_scan_has_the_same_uid_and_another_mesh_another(scan: Path) -> None:
     origin = read_origin(scan, Selection())
 
-    uids = [encode_model(stl, origin, "bone", is_modified=False)[0] for stl in (b"a", b"a", b"b")]
+    first, again, another = (
+        encode_model(stl, origin, "bone", is_modified=False)[0] for stl in (b"a", b"a", b"b")
+    )  # each with its instance
 
-    assert uids[0] == uids[1] != uids[2]
+    assert first == again != another
 
 
 @pytest.mark.parametrize("keyword", ["StudyInstanceUID", "FrameOfReferenceUID"])

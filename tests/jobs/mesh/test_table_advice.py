@@ -16,7 +16,7 @@ from clrecon.mesh.connectivity import label_components
 from clrecon.proof.surface.extract import extract_isosurface
 
 
-def make_mesh_of(volume: Volume, iso_value: float) -> Mesh:
+def make_mesh_of(volume: Volume, *, iso_value: float) -> Mesh:
     """The surface of a volume of whole HU, as a job has it."""
     vertices, normals, triangles = extract_isosurface(volume, iso_value)
     report = {**choose_iso_rule(volume, iso_value).as_report(), "iso_level_hu": iso_value - 0.5}
@@ -29,10 +29,11 @@ def test_rail_left_out_as_no_bone_is_warned_of_with_remove_table_where_the_table
     hu = np.where((abs(i - 28) < 4) & (abs(j - 12) < 4), 1500.0, 0.0)  # a rail, the same in all slices
     hu[np.hypot(i - 11, j - 12) < 5 + 3 * np.sin(k / 4)] = 1000.0  # bone, a rod of changing radius
     volume = Volume(np.rint(hu).astype(np.int16), np.diag((1.0, 1.0, 2.0, 1.0)))
-    mesh = make_mesh_of(volume, 300.0)
+    mesh = make_mesh_of(volume, iso_value=300.0)
     labelled = label_components(mesh.triangles, mesh.vertex_count)
 
-    is_bone = find_bone(mesh, volume, Surface(300.0, ""), labelled, without_table=without_table, advice="")
+    surface = Surface(name="", iso_value=300.0)
+    is_bone = find_bone(mesh, volume, surface, labelled, without_table=without_table, advice="")
 
     assert sorted(is_bone) == [False, True]
     (warning,) = mesh.report["warnings"]
@@ -43,8 +44,10 @@ def test_rail_left_out_as_no_bone_is_warned_of_with_remove_table_where_the_table
 
 @pytest.mark.parametrize("remove_table", [False, True])
 def test_bone_with_even_walls_is_warned_of_with_remove_table_where_it_is_not_set(remove_table):
-    tenth_even = WallLook("bone", 0.5, 0.1, 0.0, {"median": 400.0, "p90": 900.0, "p99": 1200.0}, 1000)
-    part = Part(Surface(300.0, ""), "", Mesh(np.zeros((3, 3), np.float32), np.zeros((0, 3), np.uint32)))
+    wall_hu = {"median": 400.0, "p90": 900.0, "p99": 1200.0}
+    tenth_even = WallLook("bone", 0.5, contrast_share=0.1, metal_share=0.0, wall_hu=wall_hu, samples=1000)
+    no_mesh = Mesh(np.zeros((3, 3), np.float32), np.zeros((0, 3), np.uint32))
+    part = Part(Surface(name="", iso_value=300.0), name="", mesh=no_mesh)
     part.facts["walls"] = tenth_even
 
     (warning,) = warn_of_walls([part], MeshSettings(keep="bone", remove_table=remove_table))
@@ -62,7 +65,7 @@ def judge_walls_of_a_block(gates: list[dict]) -> tuple[Part, list[str]]:
     voxels = np.zeros((40, 40, 40), np.int16)
     voxels[10:30, 10:30, 10:30] = 380
     volume = Volume(voxels, np.eye(4), {"gates": gates})
-    part = Part(Surface("", 190.0), "", make_mesh_of(volume, 190.0))
+    part = Part(Surface(name="", iso_value=190.0), name="", mesh=make_mesh_of(volume, iso_value=190.0))
     settings = MeshSettings(half_way="auto")
     judge_surfaces([part], volume, settings, lambda mesh: label_components(mesh.triangles, mesh.vertex_count))
     return part, warn_of_walls([part], settings)
@@ -70,7 +73,8 @@ def judge_walls_of_a_block(gates: list[dict]) -> tuple[Part, list[str]]:
 
 def test_even_block_of_380_hu_is_warned_of_as_no_bone():
     _, warnings = judge_walls_of_a_block(gates=[])
-    assert "nothing here looks like bone" in warnings[0]
+    (warning,) = warnings
+    assert "nothing here looks like bone" in warning
 
 
 @pytest.mark.parametrize("name", ["hu_known", "hu_scale"])
@@ -86,9 +90,9 @@ def keep_bone_of_a_ball(gates: list[dict]) -> tuple[list[bool], list[str]]:
     """Find bone in a ball of 1000 in a volume with these gates; return which components are bone, and the warnings."""
     hu = np.where(np.linalg.norm(np.indices((24, 24, 24)) - 11.5, axis=0) < 8, 1000, 0)
     volume = Volume(hu.astype(np.int16), np.eye(4), {"gates": gates})
-    mesh = make_mesh_of(volume, 500.0)
+    mesh = make_mesh_of(volume, iso_value=500.0)
     labelled = label_components(mesh.triangles, mesh.vertex_count)
-    is_bone = find_bone(mesh, volume, Surface("", 500.0), labelled, advice="")
+    is_bone = find_bone(mesh, volume, Surface(name="", iso_value=500.0), labelled, advice="")
     return is_bone.tolist(), mesh.report.get("warnings", [])
 
 

@@ -36,6 +36,7 @@ def cloud() -> PointCloud:
 
 @pytest.fixture(scope="module")
 def cloud_file(cloud: PointCloud, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """ball.ply, the 6000 points of `cloud`."""
     path = tmp_path_factory.mktemp("clouds") / "ball.ply"
     cloud.save(path)
     return path
@@ -69,7 +70,7 @@ def test_report_of_a_picture_of_a_cloud_has_its_look_and_counts_the_points_of_ea
     points = report["pictures"][0]["points"]
     assert (points["radius_mm"], points["color_by"], points["shading"]) == (0.4, "removed", "normals")
     reasons = [entry["name"] for entry in points["legend"]]
-    assert reasons == [None, "kept", None, None][: len(reasons)]  # of the labels -1 to 2 only 0 has a name
+    assert reasons == [None, "kept", None, None]  # of the labels -1 to 2 only 0 has a name
     assert sum(entry["points"] for entry in points["legend"]) == report["cloud"]["points"] == 6000
     assert (report["cloud"]["file"]["kind"], report["volume"]) == ("PLY", {})
 
@@ -103,7 +104,8 @@ def test_white_cloud_has_shades_of_grey_only_with_a_light(
     assert main(["render", str(cloud_file), "-o", str(tmp_path / "a.png"), *look]) == 0
 
     greys = set(np.unique(np.asarray(Image.open(tmp_path / "a.png").convert("L"))))
-    assert len(greys) > 20 if is_shaded else greys == {0, 255}  # the background, and white
+    background, white = 0, 255
+    assert len(greys) > 100 if is_shaded else greys == {background, white}  # measured 202
 
 
 @pytest.mark.parametrize(

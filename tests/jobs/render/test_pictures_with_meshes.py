@@ -59,10 +59,9 @@ def test_mesh_file_alone_is_rendered_in_mode_mesh(
 def test_picture_of_meshes_in_two_frames_is_centred_between_them(
     device: Any, files: dict[str, Path], tmp_path: Path
 ) -> None:
-    pictures = PictureFiles(str(tmp_path / "out.png"), None, None, None, None)
-    settings = RenderSettings.of("mesh", size=(64, 48), meshes=(MeshFile(str(files["lps.stl"]), "red"),))
+    settings = RenderSettings.of("mesh", size=(64, 48), meshes=(MeshFile(str(files["lps.stl"]), color="red"),))
 
-    report = make_pictures(files["ras.ply"], pictures, settings)
+    report = make_pictures(files["ras.ply"], PictureFiles(tmp_path / "out.png"), settings)
 
     assert (report.mode, report.cloud) == ("mesh", None)
     assert [mesh["file"]["space"] for mesh in report.meshes] == ["RAS", "LPS"]
@@ -106,7 +105,7 @@ def test_meshes_are_drawn_into_a_scan_in_colours_of_their_own(
     extra = {"iso_value": 300.0} if mode == "surface" else {}
     settings = RenderSettings.of(mode, size=(64, 48), meshes=meshes, **extra)
 
-    report = make_pictures(files["scan.nii"], PictureFiles(str(out), None, None, None, None), settings)
+    report = make_pictures(files["scan.nii"], PictureFiles(out), settings)
 
     assert out.exists() and report.mode == mode
     assert report.meshes[0]["color"] != report.meshes[1]["color"]
@@ -115,9 +114,8 @@ def test_meshes_are_drawn_into_a_scan_in_colours_of_their_own(
 
 def test_mesh_that_names_no_frame_is_drawn_with_a_warning(device: Any, files: dict[str, Path], tmp_path: Path) -> None:
     settings = RenderSettings.of("dvr", size=(64, 48), meshes=(MeshFile(str(files["plain.stl"])),))
-    pictures = PictureFiles(str(tmp_path / "out.png"), None, None, None, None)
 
-    report = make_pictures(files["scan.nii"], pictures, settings)
+    report = make_pictures(files["scan.nii"], PictureFiles(tmp_path / "out.png"), settings)
 
     assert any("plain.stl names no patient frame" in text for text in report.warnings)
 
@@ -249,4 +247,4 @@ def test_options_without_meaning_for_meshes_are_refused_in_one_line(
 
 def test_mesh_file_in_an_unknown_colour_is_refused() -> None:
     with refused(UsageError, "colour", "octarine"):
-        MeshFile("a.stl", "octarine")
+        MeshFile("a.stl", color="octarine")

@@ -29,8 +29,8 @@ SIZE = (48, 40)
 
 
 @pytest.fixture(scope="module")
-def sphere(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
-    """A tilted, oblique, anisotropic sphere."""
+def sphere_and_truth(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """The folder of a tilted, oblique, anisotropic CT of a sphere, and its truth."""
     folder = tmp_path_factory.mktemp("render") / "ct"
     settings = PhantomSettings(
         kind="sphere", size=(44, 60), slices=31, spacing=(0.5, 0.7, 1.0), tilt=15.0, oblique=(20.0, 5.0, -40.0), noise=0
@@ -39,17 +39,30 @@ def sphere(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, An
 
 
 @pytest.fixture(scope="module")
-def views_of_sphere(device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path_factory: Any) -> tuple[Path, Any]:
+def sphere(sphere_and_truth: tuple[Path, dict[str, Any]]) -> Path:
+    folder, _ = sphere_and_truth
+    return folder
+
+
+@pytest.fixture(scope="module")
+def true_surface(sphere_and_truth: tuple[Path, dict[str, Any]]) -> dict[str, Any]:
+    """Radius and centre of the sphere."""
+    _, truth = sphere_and_truth
+    return truth["surface"]
+
+
+@pytest.fixture(scope="module")
+def views_of_sphere(device: Any, sphere: Path, tmp_path_factory: Any) -> tuple[Path, Any]:
     """The folder with r.json and the depths d_VIEW.npy of the sphere from three sides, and the report."""
     folder = tmp_path_factory.mktemp("views")
     files = PictureFiles(folder / "a.png", depth=folder / "d.npy", report=folder / "r.json")
     settings = RenderSettings.of(views=("anterior", "left", "40,-25"), size=SIZE, device=str(device.index))
-    return folder, make_pictures(sphere[0], files, settings)
+    return folder, make_pictures(sphere, files, settings)
 
 
-def test_sphere_is_a_disc_of_its_area_from_every_side(views_of_sphere: tuple[Path, Any], sphere: Any) -> None:
+def test_sphere_is_a_disc_of_its_area_from_every_side(views_of_sphere: tuple[Path, Any], true_surface: Any) -> None:
     folder, report = views_of_sphere
-    radius_mm = sphere[1]["surface"]["radius_mm"]
+    radius_mm = true_surface["radius_mm"]
 
     areas = [
         np.isfinite(np.load(folder / f"d_{picture['name']}.npy")).sum() * picture["pixel_mm"] ** 2
@@ -60,16 +73,15 @@ def test_sphere_is_a_disc_of_its_area_from_every_side(views_of_sphere: tuple[Pat
 
 
 def test_least_depth_of_a_sphere_is_that_of_its_nearest_point_from_every_side(
-    views_of_sphere: tuple[Path, Any], sphere: Any
+    views_of_sphere: tuple[Path, Any], true_surface: Any
 ) -> None:
     folder, report = views_of_sphere
-    surface = sphere[1]["surface"]
 
     for picture in report["pictures"]:
         camera = picture["camera"]
         position, focal = np.array(camera["position_lps_mm"]), np.array(camera["focal_point_lps_mm"])
         forward = (focal - position) / np.linalg.norm(focal - position)
-        nearest_mm = (np.array(surface["center_lps_mm"]) - position) @ forward - surface["radius_mm"]
+        nearest_mm = (np.array(true_surface["center_lps_mm"]) - position) @ forward - true_surface["radius_mm"]
         depth = np.load(folder / f"d_{picture['name']}.npy")
         assert float(np.nanmin(depth)) == pytest.approx(nearest_mm, abs=0.7)  # voxels of up to 1 mm
 
@@ -81,27 +93,27 @@ def test_written_report_of_pictures_is_the_returned_one(views_of_sphere: tuple[P
 
 @pytest.mark.parametrize("mode", daily(1, ["dvr", "slice"]))
 def test_views_fit_scales_of_their_own_which_zoom_makes_one(
-    mode: str, device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
+    mode: str, device: Any, sphere: Path, tmp_path: Path
 ) -> None:
     files = PictureFiles(tmp_path / "a.png")
     settings = RenderSettings.of(mode, views=("anterior", "left", "superior"), size=SIZE, device=str(device.index))
-    fitted = {made["view"]: made["pixel_mm"] for made in make_pictures(sphere[0], files, settings)["pictures"]}
+    fitted = {made["view"]: made["pixel_mm"] for made in make_pictures(sphere, files, settings)["pictures"]}
     largest = max(fitted.values())
     assert min(fitted.values()) < 0.95 * largest  # measured 0.76: they differ
     for view, pixel_mm in fitted.items():
-        alone = make_pictures(sphere[0], files, replace(settings, views=(view,), zoom=pixel_mm / largest))
+        alone = make_pictures(sphere, files, replace(settings, views=(view,), zoom=pixel_mm / largest))
         assert alone["pictures"][0]["pixel_mm"] == pytest.approx(largest, rel=1e-4)
 
 
 @pytest.fixture(scope="module")
-def mip_and_turntable(device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path_factory: Any) -> tuple[Path, Any]:
+def mip_and_turntable(device: Any, sphere: Path, tmp_path_factory: Any) -> tuple[Path, Any]:
     """The folder of a.png, a.npy and two frames in frames/ of a maximum intensity projection, and the report."""
     folder = tmp_path_factory.mktemp("mip")
     files = PictureFiles(folder / "a.png", turntable=folder / "frames", depth=folder / "a.npy")
     settings = RenderSettings.of(
         "mip", window=(-100, 100), size=SIZE, turntable=Turntable(2), device=str(device.index), memory=10**9
     )
-    return folder, make_pictures(sphere[0], files, settings)
+    return folder, make_pictures(sphere, files, settings)
 
 
 def test_report_of_pictures_has_mode_device_memory_and_tilt(mip_and_turntable: tuple[Path, Any], device: Any) -> None:
@@ -112,7 +124,8 @@ def test_report_of_pictures_has_mode_device_memory_and_tilt(mip_and_turntable: t
 
 
 def test_times_of_pictures_sum_to_the_total(mip_and_turntable: tuple[Path, Any]) -> None:
-    seconds = dict(mip_and_turntable[1]["seconds"])
+    _, report = mip_and_turntable
+    seconds = dict(report["seconds"])
     total = seconds.pop("total")
     assert total == pytest.approx(sum(seconds.values()), abs=0.01)  # each is rounded to 0.1 ms
 
@@ -125,12 +138,12 @@ def test_report_of_a_turntable_has_the_bytes_of_its_frames(mip_and_turntable: tu
 
 
 def test_progress_of_pictures_names_its_stages_in_order_and_counts_frames(
-    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
+    device: Any, sphere: Path, tmp_path: Path
 ) -> None:
     stages: list[tuple[str, int, int]] = []
     files = PictureFiles(tmp_path / "a.png", turntable=tmp_path / "a.gif")
-    settings = RenderSettings.of(size=SIZE, turntable=Turntable(3, 10.0, 90.0), device=str(device.index))
-    make_pictures(sphere[0], files, settings, progress=lambda *step: stages.append(step))
+    settings = RenderSettings.of(size=SIZE, turntable=Turntable(frames=3), device=str(device.index))
+    make_pictures(sphere, files, settings, progress=lambda *step: stages.append(step))
     assert list(dict.fromkeys(stage for stage, _, _ in stages)) == ["device", "scan", "read", "render", "frames"]
     assert [step for step in stages if step[0] == "frames"] == [("frames", done, 3) for done in range(4)]
 
@@ -169,7 +182,7 @@ def fail(*_: Any, **__: Any) -> Any:
     ids=["depths", "report", "movie", "last step"],
 )
 def test_older_files_of_a_picture_stay_where_one_of_them_cannot_be_written(
-    failing_step: str, device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    failing_step: str, device: Any, sphere: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     names = ["a.png", "a.npy", "a.json", "a.gif"]
     for name in names:
@@ -179,13 +192,13 @@ def test_older_files_of_a_picture_stay_where_one_of_them_cannot_be_written(
 
     monkeypatch.setattr(failing_step, fail)
     with refused(OutputError, "full"):
-        make_pictures(sphere[0], PictureFiles(picture, depth, None, movie, report), settings)
+        make_pictures(sphere, PictureFiles(picture, depth=depth, turntable=movie, report=report), settings)
 
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == dict.fromkeys(names, b"old")
 
 
 def test_older_picture_of_a_first_view_stays_where_the_second_cannot_be_taken(
-    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    device: Any, sphere: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "a_left.png").write_bytes(b"old")
     settings = RenderSettings.of(views=("left", "right"), size=SIZE, device=str(device.index))
@@ -195,21 +208,21 @@ def test_older_picture_of_a_first_view_stays_where_the_second_cannot_be_taken(
         PictureTaker, "take_view", lambda taker, view: fail() if view == "right" else take_view(taker, view)
     )
     with refused(OutputError, "full"):
-        make_pictures(sphere[0], PictureFiles(tmp_path / "a.png"), settings)
+        make_pictures(sphere, PictureFiles(tmp_path / "a.png"), settings)
 
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {"a_left.png": b"old"}
 
 
 @pytest.fixture
-def two_frames(device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path) -> tuple[Path, RenderSettings]:
+def two_frames(device: Any, sphere: Path, tmp_path: Path) -> tuple[Path, RenderSettings]:
     """The folder of a turntable of two frames, and settings for one of three."""
     settings = RenderSettings.of(size=SIZE, turntable=Turntable(2), device=str(device.index))
-    make_pictures(sphere[0], PictureFiles(turntable=tmp_path / "frames"), settings)
+    make_pictures(sphere, PictureFiles(turntable=tmp_path / "frames"), settings)
     return tmp_path / "frames", replace(settings, turntable=Turntable(3), views=("left",))
 
 
 def test_older_folder_of_frames_stays_where_the_report_cannot_be_written(
-    two_frames: tuple[Path, RenderSettings], sphere: tuple[Path, dict[str, Any]], tmp_path: Path,
+    two_frames: tuple[Path, RenderSettings], sphere: Path, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     frames, settings = two_frames
@@ -217,18 +230,18 @@ def test_older_folder_of_frames_stays_where_the_report_cannot_be_written(
 
     monkeypatch.setattr("clrecon.jobs.run.stage_report", fail)
     with refused(OutputError, "full"):
-        make_pictures(sphere[0], PictureFiles(turntable=frames, report=tmp_path / "a.json"), settings)
+        make_pictures(sphere, PictureFiles(turntable=frames, report=tmp_path / "a.json"), settings)
 
     assert {path.name: path.read_bytes() for path in frames.iterdir()} == older
     assert [path.name for path in tmp_path.iterdir()] == ["frames"]
 
 
 def test_folder_of_frames_is_replaced_together_with_the_report(
-    two_frames: tuple[Path, RenderSettings], sphere: tuple[Path, dict[str, Any]], tmp_path: Path
+    two_frames: tuple[Path, RenderSettings], sphere: Path, tmp_path: Path
 ) -> None:
     frames, settings = two_frames
 
-    make_pictures(sphere[0], PictureFiles(turntable=frames, report=tmp_path / "a.json"), settings)
+    make_pictures(sphere, PictureFiles(turntable=frames, report=tmp_path / "a.json"), settings)
 
     assert sorted(path.name for path in frames.iterdir()) == [f"frame_000{number}.png" for number in range(3)]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.json", "frames"]
@@ -236,31 +249,29 @@ def test_folder_of_frames_is_replaced_together_with_the_report(
 
 @pytest.mark.parametrize("name", ["v1.2/", "v1.2"], ids=["slash at the end", "no slash"])
 def test_folder_of_frames_with_a_dot_in_its_name_is_reported_as_a_folder(
-    name: str, device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
+    name: str, device: Any, sphere: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "v1.2").mkdir()
     settings = RenderSettings.of(size=SIZE, turntable=Turntable(2), background="transparent", device=str(device.index))
 
-    report = make_pictures(sphere[0], PictureFiles(turntable=f"{tmp_path}/{name}"), settings)
+    report = make_pictures(sphere, PictureFiles(turntable=f"{tmp_path}/{name}"), settings)
 
     assert report["turntable"]["output"]["format"] == "folder"
 
 
-def test_earlier_folder_of_frames_named_as_a_movie_takes_new_frames(
-    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
-) -> None:
+def test_earlier_folder_of_frames_named_as_a_movie_takes_new_frames(device: Any, sphere: Path, tmp_path: Path) -> None:
     settings = RenderSettings.of(size=SIZE, turntable=Turntable(2), background="transparent", device=str(device.index))
-    make_pictures(sphere[0], PictureFiles(turntable=f"{tmp_path}/frames/"), settings)
+    make_pictures(sphere, PictureFiles(turntable=f"{tmp_path}/frames/"), settings)
     (tmp_path / "frames").rename(tmp_path / "v1.gif")
 
-    report = make_pictures(sphere[0], PictureFiles(turntable=tmp_path / "v1.gif"), settings)
+    report = make_pictures(sphere, PictureFiles(turntable=tmp_path / "v1.gif"), settings)
 
     assert report["turntable"]["frames"] == len(list((tmp_path / "v1.gif").iterdir())) == 2
 
 
 @pytest.mark.skipif(os.name != "posix", reason="the limit of open files is that of POSIX systems")
 def test_more_views_than_open_files_are_allowed_are_written_where_the_limit_can_be_raised(
-    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
+    device: Any, sphere: Path, tmp_path: Path
 ) -> None:
     import resource
 
@@ -269,7 +280,7 @@ def test_more_views_than_open_files_are_allowed_are_written_where_the_limit_can_
     with open(os.devnull) as file:
         resource.setrlimit(resource.RLIMIT_NOFILE, (file.fileno() + 30, limits[1]))
     try:
-        report = make_pictures(sphere[0], PictureFiles(tmp_path / "a.png", tmp_path / "a.npy"), settings)
+        report = make_pictures(sphere, PictureFiles(tmp_path / "a.png", depth=tmp_path / "a.npy"), settings)
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, limits)
     assert len(report["pictures"]) == 60 and len(list(tmp_path.iterdir())) == 120
@@ -283,12 +294,10 @@ def test_report_within_the_folder_of_frames_is_refused(tmp_path: Path) -> None:
     assert list((tmp_path / "frames").iterdir()) == []
 
 
-def test_picture_of_a_volume_in_slabs_is_that_of_the_whole(
-    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
-) -> None:
+def test_picture_of_a_volume_in_slabs_is_that_of_the_whole(device: Any, sphere: Path, tmp_path: Path) -> None:
     def draw_with(memory: int | None) -> tuple[int, np.ndarray]:
         settings = RenderSettings.of(size=SIZE, views=("30,20",), device=str(device.index), memory=memory)
-        report = make_pictures(sphere[0], PictureFiles(tmp_path / "a.png"), settings)
+        report = make_pictures(sphere, PictureFiles(tmp_path / "a.png"), settings)
         return report["pictures"][0]["slabs"], np.asarray(Image.open(tmp_path / "a.png")).astype(int)
 
     slabs_of_whole, whole = draw_with(memory=None)
@@ -300,11 +309,11 @@ def test_picture_of_a_volume_in_slabs_is_that_of_the_whole(
 
 
 def test_x_ray_is_a_sum_in_mm_of_water_with_a_window_within_its_values(
-    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
+    device: Any, sphere: Path, tmp_path: Path
 ) -> None:
     settings = RenderSettings.of(preset="x-ray", size=SIZE, device=str(device.index))
 
-    report = make_pictures(sphere[0], PictureFiles(tmp_path / "a.png", values=tmp_path / "v.npy"), settings)
+    report = make_pictures(sphere, PictureFiles(tmp_path / "a.png", values=tmp_path / "v.npy"), settings)
 
     picture, most_mm = report["pictures"][0], float(np.load(tmp_path / "v.npy").max())
     assert report["mode"] == "drr"
@@ -314,16 +323,14 @@ def test_x_ray_is_a_sum_in_mm_of_water_with_a_window_within_its_values(
     assert 0.05 * most_mm < low < high <= most_mm  # of the rays that meet the body
 
 
-def test_given_window_of_an_x_ray_is_in_mm_of_water(
-    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
-) -> None:
+def test_given_window_of_an_x_ray_is_in_mm_of_water(device: Any, sphere: Path, tmp_path: Path) -> None:
     files = PictureFiles(tmp_path / "a.png", values=tmp_path / "v.npy")
     settings = RenderSettings.of(preset="x-ray", size=SIZE, device=str(device.index))
-    make_pictures(sphere[0], files, settings)
+    make_pictures(sphere, files, settings)
     twice_the_most_mm = 2.0 * float(np.load(tmp_path / "v.npy").max())
 
     windowed = replace(settings, style=Projection("drr", window=(0.0, twice_the_most_mm)))
-    picture = make_pictures(sphere[0], files, windowed)["pictures"][0]
+    picture = make_pictures(sphere, files, windowed)["pictures"][0]
 
     assert picture["window_mm_water"] == [0.0, pytest.approx(twice_the_most_mm)]
     middle_grey = (127, 128)
@@ -351,27 +358,25 @@ EMPTY_LOOKS = daily_rows(
 
 @pytest.mark.parametrize(("settings", "words"), EMPTY_LOOKS)
 def test_picture_that_shows_nothing_is_warned_of(
-    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path, settings: dict[str, Any], words: str
+    device: Any, sphere: Path, tmp_path: Path, settings: dict[str, Any], words: str
 ) -> None:
     looks = RenderSettings.of(size=SIZE, device=str(device.index), **settings)
-    report = make_pictures(sphere[0], PictureFiles(tmp_path / "a.png"), looks)
+    report = make_pictures(sphere, PictureFiles(tmp_path / "a.png"), looks)
     assert any(re.search(words, text) for text in report["warnings"])
 
 
 @pytest.mark.parametrize(("settings", "words"), EMPTY_LOOKS[:5])  # a slice does not turn
 def test_turntable_that_shows_nothing_is_warned_of(
-    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path, settings: dict[str, Any], words: str
+    device: Any, sphere: Path, tmp_path: Path, settings: dict[str, Any], words: str
 ) -> None:
     looks = RenderSettings.of(size=SIZE, turntable=Turntable(2), device=str(device.index), **settings)
-    report = make_pictures(sphere[0], PictureFiles(turntable=tmp_path / "b.gif"), looks)
+    report = make_pictures(sphere, PictureFiles(turntable=tmp_path / "b.gif"), looks)
     assert any(re.search(words, text) for text in report["warnings"])
 
 
-def test_picture_that_shows_a_sphere_has_no_warning_of_emptiness(
-    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
-) -> None:
+def test_picture_that_shows_a_sphere_has_no_warning_of_emptiness(device: Any, sphere: Path, tmp_path: Path) -> None:
     settings = RenderSettings.of(size=SIZE, device=str(device.index))
-    report = make_pictures(sphere[0], PictureFiles(tmp_path / "a.png"), settings)
+    report = make_pictures(sphere, PictureFiles(tmp_path / "a.png"), settings)
     assert not any("picture is" in text or "nothing" in text for text in report["warnings"])
 
 
@@ -440,12 +445,12 @@ def test_impossible_settings_of_a_picture_are_refused(wrong: dict[str, Any], wor
 
 def test_unknown_colour_of_a_label_in_a_picture_is_refused() -> None:
     with refused(UsageError, "octarine"):
-        LabelLook("a.nii", {"L1": "octarine"})
+        LabelLook("a.nii", colors={"L1": "octarine"})
 
 
 def test_opacity_of_a_label_above_1_is_refused() -> None:
     with refused(UsageError, "L1", 1.5):
-        LabelLook("a.nii", {}, {"L1": 1.5})
+        LabelLook("a.nii", opacities={"L1": 1.5})
 
 
 @pytest.fixture
@@ -480,11 +485,11 @@ def test_no_transfer_function_is_read_where_none_is_named() -> None:
 
 
 def test_slices_in_space_are_seen_obliquely_by_default_without_a_warning(
-    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
+    device: Any, sphere: Path, tmp_path: Path
 ) -> None:
     settings = RenderSettings.of("slices", size=SIZE, device=str(device.index))
 
-    report = make_pictures(sphere[0], PictureFiles(tmp_path / "a.png"), settings)
+    report = make_pictures(sphere, PictureFiles(tmp_path / "a.png"), settings)
 
     assert report["pictures"][0]["view"] == "30,30"
     assert report["pictures"][0]["hit_share"] > 0.1  # measured 0.106; seen edge-on it is 0
@@ -492,17 +497,17 @@ def test_slices_in_space_are_seen_obliquely_by_default_without_a_warning(
 
 
 @pytest.fixture
-def sheet_settings(device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path) -> RenderSettings:
+def sheet_settings(device: Any, sphere: Path, tmp_path: Path) -> RenderSettings:
     """Settings of a sheet of six slices with a label map of what lies above 100 HU, in red."""
-    volume = read_volume(sphere[0])
+    volume = read_volume(sphere)
     above_100_hu = LabelMap((volume.voxels > 100).astype(np.uint8), volume.affine, {1: "ball"})
     (tmp_path / "ball.nii.gz").write_bytes(encode_nifti(above_100_hu, packed=True))
-    labels = LabelLook(str(tmp_path / "ball.nii.gz"), {"1": "#ff0000"})
+    labels = LabelLook(str(tmp_path / "ball.nii.gz"), colors={"1": "#ff0000"})
     return RenderSettings.of(sheet=6, labels=labels, letters=True, scale_bar=True, device=str(device.index))
 
 
 def test_report_of_a_sheet_has_its_size_slices_and_colours_of_labels(
-    sheet_settings: RenderSettings, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
+    sheet_settings: RenderSettings, sphere: Path, tmp_path: Path
 ) -> None:
     assert (sheet_settings.mode, sheet_settings.style.is_sheet, sheet_settings.size_used) == (
         "slice",
@@ -510,7 +515,7 @@ def test_report_of_a_sheet_has_its_size_slices_and_colours_of_labels(
         (1600, 1200),
     )
 
-    report = make_pictures(sphere[0], PictureFiles(tmp_path / "a.png"), sheet_settings)
+    report = make_pictures(sphere, PictureFiles(tmp_path / "a.png"), sheet_settings)
 
     picture = report["pictures"][0]
     assert picture["size"] == [1600, 1200]
@@ -520,9 +525,9 @@ def test_report_of_a_sheet_has_its_size_slices_and_colours_of_labels(
 
 
 def test_red_pixels_of_a_sheet_are_those_of_its_label(
-    sheet_settings: RenderSettings, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
+    sheet_settings: RenderSettings, sphere: Path, tmp_path: Path
 ) -> None:
-    make_pictures(sphere[0], PictureFiles(tmp_path / "a.png", values=tmp_path / "v.npy"), sheet_settings)
+    make_pictures(sphere, PictureFiles(tmp_path / "a.png", values=tmp_path / "v.npy"), sheet_settings)
 
     image = np.asarray(Image.open(tmp_path / "a.png").convert("RGB")).astype(int)
     is_red = (image[..., 0] - image[..., 1]) > 30
@@ -530,11 +535,9 @@ def test_red_pixels_of_a_sheet_are_those_of_its_label(
     assert is_red.sum() == pytest.approx(in_label.sum(), rel=0.15)  # voxels of the label against interpolated HU
 
 
-def test_depths_of_a_sheet_are_refused(
-    sheet_settings: RenderSettings, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
-) -> None:
+def test_depths_of_a_sheet_are_refused(sheet_settings: RenderSettings, sphere: Path, tmp_path: Path) -> None:
     with refused(UsageError, "sheet", "depths"):
-        make_pictures(sphere[0], PictureFiles(tmp_path / "a.png", depth=tmp_path / "d.npy"), sheet_settings)
+        make_pictures(sphere, PictureFiles(tmp_path / "a.png", depth=tmp_path / "d.npy"), sheet_settings)
 
 
 @dataclass

@@ -24,6 +24,7 @@ pytestmark = pytest.mark.unit
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a scan, a mesh and a cloud in LPS and RAS each, a map of label 5, and a cloud without a frame."""
     folder = tmp_path_factory.mktemp("inputs")
     scenes.make_scan().save(folder / "scan.nii.gz")
     scenes.make_mesh().save(folder / "lps.stl")
@@ -44,8 +45,7 @@ def test_kind_of_an_input_of_a_view_follows_from_its_file(files):
 
 
 def test_scan_and_label_map_of_a_view_lie_at_the_place_of_their_files(files):
-    opened = open_inputs([files / "scan.nii.gz", files / "labels.nii.gz"])
-    scan, labels = opened[0].subject, opened[1].subject
+    scan, labels = (opened.subject for opened in open_inputs([files / "scan.nii.gz", files / "labels.nii.gz"]))
     assert isinstance(scan, Volume) and isinstance(labels, LabelMap)
     assert np.allclose(scan.affine, scenes.AFFINE, atol=1e-4)
     assert np.allclose(labels.affine, scenes.AFFINE, atol=1e-4)
@@ -79,10 +79,10 @@ def test_inputs_of_a_view_have_given_names_or_kind_and_number(files):
 
 
 def test_label_map_of_a_view_is_shown_within_the_first_scan_with_its_remarks(files):
-    opened = open_inputs([files / "scan.nii.gz", files / "labels.nii.gz"])
-    _, labels = wrap_inputs(opened)
+    scan, label_map = open_inputs([files / "scan.nii.gz", files / "labels.nii.gz"])
+    _, labels = wrap_inputs([scan, label_map])
     assert isinstance(labels, ShownLabels) and labels.within == 1
-    assert labels.said == opened[1].said
+    assert labels.said == label_map.said
 
 
 def test_cloud_that_names_no_frame_is_read_in_the_given_one(files):
@@ -99,22 +99,23 @@ def test_cloud_that_names_no_frame_is_taken_as_lps_with_a_remark(files):
 
 
 @pytest.fixture
-def with_labels(files):
+def settings_with_labels(files):
+    """Settings that name the label map."""
     return ViewSettings(scan=MeshSettings(labels=LabelChoice(files / "labels.nii.gz")))
 
 
-def test_label_map_of_the_settings_is_the_last_input_of_a_view(files, with_labels):
-    opened = open_inputs([files / "scan.nii.gz"], with_labels)
+def test_label_map_of_the_settings_is_the_last_input_of_a_view(files, settings_with_labels):
+    opened = open_inputs([files / "scan.nii.gz"], settings_with_labels)
     assert [type(each.subject) for each in opened] == [Volume, LabelMap]
 
 
-def test_label_map_of_the_settings_may_be_the_only_input_of_a_view(with_labels):
-    assert [type(each.subject) for each in open_inputs([], with_labels)] == [LabelMap]
+def test_label_map_of_the_settings_may_be_the_only_input_of_a_view(settings_with_labels):
+    assert [type(each.subject) for each in open_inputs([], settings_with_labels)] == [LabelMap]
 
 
-def test_label_map_of_the_settings_is_refused_for_two_scans(files, with_labels):
-    with refused(UsageError, 2):
-        open_inputs([files / "scan.nii.gz", files / "scan.nii.gz"], with_labels)
+def test_label_map_of_the_settings_is_refused_for_two_scans(files, settings_with_labels):
+    with refused(UsageError, 2):  # scans
+        open_inputs([files / "scan.nii.gz", files / "scan.nii.gz"], settings_with_labels)
 
 
 @pytest.mark.parametrize(

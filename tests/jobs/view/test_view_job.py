@@ -29,9 +29,10 @@ def files(tmp_path: Path) -> dict[str, Path]:
     return found
 
 
-def read_page(path: Path):
-    facts, coded = parse_page(path.read_bytes())
-    return facts, *decode_surface(coded)
+def read_facts(page: Path):
+    """What a page says of its surface."""
+    facts, _ = parse_page(page.read_bytes())
+    return facts
 
 
 @pytest.mark.unit
@@ -41,7 +42,8 @@ def test_meshes_of_a_page_lie_at_their_places_in_lps_and_the_turned_one_is_named
     assert main(["view", str(files["DOE_JANE.stl"]), str(files["b.ply"]), "--html", str(page)]) == 0
 
     printed().assert_output("RAS", "LPS")
-    facts, vertices, _, triangles = read_page(page)
+    facts, coded = parse_page(page.read_bytes())
+    vertices, _, triangles = decode_surface(coded)
     first, second = (
         vertices[triangles[part["first"] : part["first"] + part["count"]].reshape(-1)] for part in facts["parts"]
     )
@@ -57,7 +59,7 @@ def test_meshes_of_a_page_have_their_given_names_colours_and_volumes(files, tmp_
 
     assert main(["view", str(files["DOE_JANE.stl"]), str(files["b.ply"]), "--html", str(page), *names]) == 0
 
-    bone, screw = read_page(page)[0]["parts"]
+    bone, screw = read_facts(page)["parts"]
     assert (bone["name"], screw["name"]) == ("bone", "screw")
     assert bone["color"] != screw["color"]
     assert bone["ml"] == pytest.approx(2**3 * screw["ml"], rel=1e-3)  # twice the radius
@@ -71,7 +73,8 @@ def test_page_and_report_have_numbers_in_place_of_names_of_files(files, tmp_path
     content = page.read_bytes()
     assert b"DOE_JANE" not in content and str(tmp_path).encode() not in content
     assert [part["name"] for part in report["parts"]] == ["surface 1", "surface 2"]
-    assert report["inputs"][1]["space_from"] == "file"
+    _, in_ras = report["inputs"]
+    assert in_ras["space_from"] == "file"
     assert report["output"] == {"format": "html", "bytes": len(content)}
     assert report["device"] is None
 
@@ -94,12 +97,12 @@ def test_page_of_a_scan_has_its_surface_by_components_with_their_volumes(tmp_pat
 
     assert main(["view", str(source), "--html", str(page), "--hu", "0"]) == 0
 
-    facts = read_page(page)[0]
+    facts = read_facts(page)
     assert [part["name"] for part in facts["parts"]] == ["part 1", "part 2"]
     mesh = clrecon.extract_isosurface(clrecon.read_volume(source), 0)
     assert facts["triangles"] == mesh.triangle_count
     assert sum(part["ml"] for part in facts["parts"]) == pytest.approx(mesh.volume / 1000.0, rel=1e-5)  # float32
-    assert facts["about"][0] == "Surface: iso value 0 HU."
+    assert "Surface: iso value 0 HU." in facts["about"]
     printed().assert_output(0)
 
 
@@ -111,7 +114,7 @@ def test_page_of_a_scan_with_labels_has_a_part_of_each_in_its_colour(tmp_path, d
 
     assert main(["view", str(source), "--html", str(page), *options]) == 0
 
-    first, second = read_page(page)[0]["parts"]
+    first, second = read_facts(page)["parts"]
     assert second["color"] == "#ff0000"
     assert first["color"] != "#ff0000"
 
@@ -127,7 +130,7 @@ def test_labels_of_a_page_have_the_names_of_their_files_as_they_are(tmp_path, de
 
     assert main(["view", str(source), "--html", str(tmp_path / "a.html"), "--labels", str(folder), "--hu", "0"]) == 0
 
-    assert [part["name"] for part in read_page(tmp_path / "a.html")[0]["parts"]] == [name]
+    assert [part["name"] for part in read_facts(tmp_path / "a.html")["parts"]] == [name]
 
 
 @pytest.mark.opencl
@@ -144,17 +147,18 @@ def test_page_with_slices_holds_those_of_its_scan(tmp_path, device):
 @pytest.mark.opencl
 def test_page_of_a_scan_and_a_mesh_apart_from_it_is_written_with_a_warning(tmp_path, files, printed, device):
     page = tmp_path / "both.html"
-    source = write_two_balls(tmp_path)[0]
+    source, _ = write_two_balls(tmp_path)
     assert main(["view", str(source), str(files["b.ply"]), "--html", str(page), "--hu", "0"]) == 0
-    assert [part["name"] for part in read_page(page)[0]["parts"]] == ["surface 1", "surface 2"]
+    assert [part["name"] for part in read_facts(page)["parts"]] == ["surface 1", "surface 2"]
     printed().assert_error("lie")  # the boxes lie apart
 
 
 @pytest.mark.opencl
 def test_mesh_command_writes_a_page(tmp_path, device):
     page = tmp_path / "mesh.html"
-    assert main(["mesh", str(write_two_balls(tmp_path)[0]), "-o", str(page), "--hu", "0", "--keep-largest", "1"]) == 0
-    assert [part["name"] for part in read_page(page)[0]["parts"]] == ["surface"]
+    source, _ = write_two_balls(tmp_path)
+    assert main(["mesh", str(source), "-o", str(page), "--hu", "0", "--keep-largest", "1"]) == 0
+    assert [part["name"] for part in read_facts(page)["parts"]] == ["surface"]
 
 
 @pytest.mark.unit

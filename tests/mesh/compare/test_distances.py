@@ -34,7 +34,7 @@ def rectangle(z: float, size: tuple[float, float] = (30.0, 20.0)) -> samples.Arr
 @pytest.fixture(scope="module")
 def concentric_spheres():
     """The comparison of a sphere of 10.5 mm with one of 10 mm about the same centre, from 5000 samples of each."""
-    inner, outer = (Mesh(*samples.sphere(FAR, radius, 5)) for radius in (10.0, 10.5))
+    inner, outer = (Mesh(*samples.sphere(FAR, radius=radius, rounds=5)) for radius in (10.0, 10.5))
     return compare_meshes(outer, inner, samples=5000)
 
 
@@ -43,7 +43,9 @@ PLANES_APART_MM = 1.25
 
 @pytest.fixture(scope="module")
 def parallel_planes():
-    below, above = (Mesh(rectangle(z)[0] + FAR, rectangle(z)[1]) for z in (0.0, PLANES_APART_MM))
+    """The comparison of two planes PLANES_APART_MM apart."""
+    (low, triangles), (high, _) = rectangle(0.0), rectangle(PLANES_APART_MM)
+    below, above = Mesh(low + FAR, triangles), Mesh(high + FAR, triangles)
     return compare_meshes(below, above, samples=1000)
 
 
@@ -85,7 +87,8 @@ def test_hd95_is_that_of_the_worse_side_and_assd_the_mean_of_both():
 
 
 def test_a_plane_without_volume_has_no_change_of_volume():
-    assert compare_meshes(Mesh(*rectangle(0.0)), Mesh(*rectangle(0.0)), 10)["volume_change_percent"] is None
+    plane = Mesh(*rectangle(0.0))
+    assert compare_meshes(plane, plane, samples=10)["volume_change_percent"] is None
 
 
 points_around_a_triangle = pytest.mark.parametrize(
@@ -154,13 +157,14 @@ def test_the_nearest_triangle_around_a_corner_is_the_one_that_the_point_lies_on(
 def test_distance_counts_only_the_triangles_around_the_vertex():
     """Around the corner (1, 1, 1) of a cube lie triangles of the faces x = 1, y = 1 and z = 1."""
     vertices, triangles = samples.box()
+    corner = 7  # at (1, 1, 1)
     near = NearDistance(vertices, triangles.astype(np.uint32))
     on_the_face, beside_it, beyond_an_edge, above = [1, 0.75, 0.75], [1.25, 0.75, 0.75], [3, 2, 1], [3, 2, 3]
     points = np.array([on_the_face, beside_it, beyond_an_edge, above], float)
-    distances, rows = near.find_around(points, np.full((4, 1), 7))
+    distances, rows = near.find_around(points, np.full((4, 1), corner))
     expected = [0.0, 0.25, np.hypot(2, 1), np.sqrt(2**2 + 1**2 + 2**2)]
     np.testing.assert_allclose(distances, expected, rtol=tolerances.FLOAT64_SHARE)
-    assert (triangles[rows] == 7).any(axis=1).all()
+    assert (triangles[rows] == corner).any(axis=1).all()
 
 
 @pytest.fixture(scope="module")

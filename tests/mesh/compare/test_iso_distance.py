@@ -30,7 +30,8 @@ SHAPE_IJK = (11, 9, 7)
 
 
 def measure_iso_distance(mesh: Mesh, volume: Volume, rule: IsoRule, **options: Any) -> iso_distance.IsoDistance:
-    return iso_distance.measure_iso_distances([mesh], volume, rule, **options)[0]
+    (distance,) = iso_distance.measure_iso_distances([mesh], volume, rule, **options)
+    return distance
 
 
 def voxel_indices(shape_ijk=SHAPE_IJK) -> np.ndarray:
@@ -204,14 +205,15 @@ def test_a_surface_within_two_voxels_is_found_along_lines_where_the_gradient_is_
 
     on_the_plateau, in_the_step, far_away = [3.8, 4.0, 3.0], [4.2, 4.0, 3.0], [0.5, 4.0, 3.0]
     points = volume.ijk_to_lps(np.array([on_the_plateau, in_the_step, far_away]))
-    distances = distances_to_iso_surface(volume, rule, points)
+    of_plateau, of_step, of_far_point = distances_to_iso_surface(volume, rule, points)
 
-    assert 0.7 * step_mm <= distances[0] <= 1.4 * 0.7 * step_mm  # 1.4: the lines follow the sheared grid
-    assert distances[1] == pytest.approx(0.3 * step_mm, abs=tolerances.ISO_VERTEX_VOXEL)
-    assert np.isnan(distances[2])
+    # The plane lies at i = 4.5, 0.7 steps from the plateau; 1.4: the lines follow the sheared grid.
+    assert 0.7 * step_mm <= of_plateau <= 1.4 * 0.7 * step_mm
+    assert of_step == pytest.approx(0.3 * step_mm, abs=tolerances.ISO_VERTEX_VOXEL)
+    assert np.isnan(of_far_point)
 
 
-def two_layers(axis: int, first: int, low: float = 0.0, high: float = 900.0, count: int = 12) -> Volume:
+def two_layers(axis: int, *, first: int, low: float = 0.0, high: float = 900.0, count: int = 12) -> Volume:
     """Voxels of 1 mm: `low` below the index `first` of an axis, `high` from it on."""
     shape = [4, 4, 4]
     shape[axis] = count
@@ -229,7 +231,7 @@ def test_search_for_the_iso_surface_reaches_the_voxels_of_the_cell_and_of_its_ne
     axis, along_axis, first, distance
 ):
     """In a flat cell the gradient is zero; the level lies half way to the voxels that differ."""
-    volume = two_layers(axis, first)
+    volume = two_layers(axis, first=first, low=0.0, high=900.0)
     point = np.full((1, 3), 2.0)
     point[0, axis] = along_axis
     distances = distances_to_iso_surface(volume, choose_iso_rule(volume, 450.0, closed=False), point)
@@ -239,7 +241,7 @@ def test_search_for_the_iso_surface_reaches_the_voxels_of_the_cell_and_of_its_ne
 @pytest.mark.parametrize(("level", "at_i"), [(0.25, 2.5), (0.485, 2.97)], ids=["half way", "at the end of the lines"])
 def test_lines_find_a_level_between_values_less_than_1_apart(level, at_i):
     """The values rise from 0 at i = 2 to 0.5 at i = 3; the point lies at i = 1.5."""
-    volume = two_layers(0, 3, 0.0, 0.5)
+    volume = two_layers(axis=0, first=3, low=0.0, high=0.5)
     rule = choose_iso_rule(volume, level, closed=False)
     assert distances_to_iso_surface(volume, rule, np.array([[1.5, 2.0, 2.0]])) == pytest.approx([at_i - 1.5])
 
@@ -365,7 +367,7 @@ def test_distances_are_of_the_area_and_not_of_the_number_of_points(at):
 BALL_RADIUS = 4.5
 
 
-def measure_coarse_ball(larger: float) -> iso_distance.IsoDistance:
+def measure_coarse_ball(*, larger: float) -> iso_distance.IsoDistance:
     """128 triangles with the volume of the ball that 15 voxels an edge show, `larger` times as large."""
     from_centre = np.linalg.norm(np.indices((15, 15, 15)) - 7.0, axis=0)
     volume = Volume(np.rint(1000.0 - 150.0 * (from_centre - BALL_RADIUS)).astype(np.int16), np.eye(4))
@@ -379,12 +381,12 @@ def measure_coarse_ball(larger: float) -> iso_distance.IsoDistance:
     ("larger", "ok"), [(1.0, True), (1.03, False), (0.9, False)], ids=["right", "0.14 mm larger", "0.45 mm smaller"]
 )
 def test_few_triangles_of_a_ball_are_judged_by_their_surface_of_the_right_size(larger, ok):
-    _, _, mean_gate = judge_mesh(iso_distance=measure_coarse_ball(larger))
+    _, _, mean_gate = judge_mesh(iso_distance=measure_coarse_ball(larger=larger))
     assert (mean_gate["name"], mean_gate["ok"]) == ("iso_distance_mean", ok)
 
 
 def test_corners_of_few_triangles_with_the_volume_of_a_ball_lie_outside_of_it_beyond_the_bound():
-    assert measure_coarse_ball(1.0)["vertices_voxel"]["mean"] > DEVIATION_MEAN_VOXEL
+    assert measure_coarse_ball(larger=1.0)["vertices_voxel"]["mean"] > DEVIATION_MEAN_VOXEL
 
 
 @pytest.fixture(scope="module")

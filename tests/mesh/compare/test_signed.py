@@ -90,7 +90,7 @@ def test_signed_distance_on_a_face_and_at_a_corner_is_zero_and_not_negative_zero
 @pytest.fixture(scope="module")
 def small_and_large_ball() -> tuple[Mesh, Mesh]:
     """Balls of 10 and 12 mm about one centre: vertices lie on the spheres, the triangles up to 0.02 mm within."""
-    return Mesh(*ball(10.0, 60)), Mesh(*ball(12.0, 60))
+    return Mesh(*ball(10.0, rings=60)), Mesh(*ball(12.0, rings=60))
 
 
 GAP_MM = 12.0 - 10.0
@@ -99,7 +99,7 @@ GAP_MM = 12.0 - 10.0
 def test_every_figure_of_a_ball_in_a_larger_one_is_the_gap_negative_inside(
     small_and_large_ball: tuple[Mesh, Mesh],
 ) -> None:
-    distance = clrecon.measure_distance(*small_and_large_ball, 5000)
+    distance = clrecon.measure_distance(*small_and_large_ball, samples=5000)
     to_large, to_small = distance.to_reference_signed_mm, distance.from_reference_signed_mm
     assert to_large is not None
     assert to_small is not None
@@ -112,7 +112,7 @@ def test_every_figure_of_a_ball_in_a_larger_one_is_the_gap_negative_inside(
 def test_a_ball_in_a_larger_one_has_no_share_outside_and_the_larger_one_all(
     small_and_large_ball: tuple[Mesh, Mesh],
 ) -> None:
-    distance = clrecon.measure_distance(*small_and_large_ball, 5000)
+    distance = clrecon.measure_distance(*small_and_large_ball, samples=5000)
     assert distance.to_reference_signed_mm.outside_share == 0.0  # type: ignore[union-attr]
     assert distance.from_reference_signed_mm.outside_share == 1.0  # type: ignore[union-attr]
 
@@ -120,7 +120,7 @@ def test_a_ball_in_a_larger_one_has_no_share_outside_and_the_larger_one_all(
 def test_an_even_gap_between_closed_balls_has_nearly_no_spread_and_no_warning(
     small_and_large_ball: tuple[Mesh, Mesh],
 ) -> None:
-    distance = clrecon.measure_distance(*small_and_large_ball, 5000)
+    distance = clrecon.measure_distance(*small_and_large_ball, samples=5000)
     assert distance.to_reference_signed_mm.sd < tolerances.TWO_BALLS_MM  # type: ignore[union-attr]
     assert distance.warnings == []
 
@@ -137,7 +137,7 @@ def test_each_vertex_of_the_larger_ball_has_the_gap_as_its_signed_distance(
 def test_the_figures_without_sign_are_those_of_compare_meshes() -> None:
     mesh = Mesh(*torus())
     sheared = mesh.transformed([[1.0, 0.02, 0, 0.7], [0, 1.1, 0, 0], [0, 0, 1, -0.4], [0, 0, 0, 1]])
-    signed, unsigned = measure_distance(mesh, sheared, 4000), clrecon.compare_meshes(mesh, sheared, 4000)
+    signed, unsigned = (measure(mesh, sheared, samples=4000) for measure in (measure_distance, clrecon.compare_meshes))
     assert dict(signed.to_reference_mm) == pytest.approx(dict(unsigned.to_reference_mm))
     assert dict(signed.from_reference_mm) == pytest.approx(dict(unsigned.from_reference_mm))
     assert signed.hausdorff_mm == pytest.approx(unsigned.max_mm)
@@ -152,7 +152,7 @@ INNER_BOX = Mesh(0.5 * CORNERS + 0.25, FACES)
 
 def test_distances_from_an_open_mesh_have_no_sign_and_a_warning_names_its_file() -> None:
     opened = Mesh(CORNERS, FACES[1:])
-    distance = measure_distance(INNER_BOX, opened, 100, names=("a.stl", "b.stl"))
+    distance = measure_distance(INNER_BOX, opened, samples=100, names=("a.stl", "b.stl"))
     assert distance.to_reference_signed_mm is None
     assert distance.from_reference_signed_mm is not None
     assert distance.warnings == ["b.stl is not closed (3 edges not in two triangles): distances from it have no sign"]
@@ -164,17 +164,19 @@ def test_distances_of_vertices_from_an_open_mesh_are_said_to_have_no_sign() -> N
 
 
 def test_an_inside_out_mesh_is_measured_as_if_turned_back_and_a_warning_says_so() -> None:
-    distance = measure_distance(INNER_BOX, Mesh(CORNERS, FACES[:, ::-1]), 100)
-    outward = measure_distance(INNER_BOX, Mesh(CORNERS, FACES), 100)
-    assert "inside out" in distance.warnings[0]
+    distance = measure_distance(INNER_BOX, Mesh(CORNERS, FACES[:, ::-1]), samples=100)
+    outward = measure_distance(INNER_BOX, Mesh(CORNERS, FACES), samples=100)
+    (warning,) = distance.warnings
+    assert "inside out" in warning
     assert distance.to_reference_signed_mm == outward.to_reference_signed_mm
 
 
 def test_distances_from_a_mesh_with_a_flipped_triangle_have_no_sign_and_a_warning_says_why() -> None:
     mixed = FACES.copy()
     mixed[0] = mixed[0, ::-1]
-    distance = measure_distance(INNER_BOX, Mesh(CORNERS, mixed), 100)
-    assert "do not agree" in distance.warnings[0]
+    distance = measure_distance(INNER_BOX, Mesh(CORNERS, mixed), samples=100)
+    (warning,) = distance.warnings
+    assert "do not agree" in warning
     assert distance.to_reference_signed_mm is None
 
 

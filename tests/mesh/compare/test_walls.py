@@ -76,7 +76,7 @@ CRUMB = ((4, 36, 4, 2.0, 1400),)
     ids=["cortex and marrow", "compact bone", "faint bone", "vessel", "metal", "shell of a table"],
 )
 def test_a_body_looks_like_bone_contrast_medium_or_metal_by_its_walls(bodies, looks_like, is_bone):
-    judged = judge_components_of(blurred_balls(*bodies))[0]
+    judged, *_ = judge_components_of(blurred_balls(*bodies))  # the largest component
     assert judged["looks_like"] == looks_like
     assert looks_like_bone(judged) == is_bone
 
@@ -161,7 +161,8 @@ def coarse_phantom(request):
     kind = request.param
     dj, _, dk = KINDS[kind].spacing
     settings = PhantomSettings(kind, (round(64 * dj),) * 2, slices=round(30 * dk), spacing=(4.0, 4.0, 4.0))
-    volume = Volume(*make_phantom(settings)[:2])
+    voxels, affine, _ = make_phantom(settings)
+    volume = Volume(voxels, affine)
     rule = choose_iso_rule(volume, 200.0)
     vertices, normals, triangles = extract_isosurface(volume, 200.0)
     mesh = Mesh(vertices, triangles, normals.astype(np.float32))
@@ -266,7 +267,7 @@ def test_points_in_a_cell_and_its_26_neighbours_are_near(spacing):
     marked = np.multiply([1, 0, 2], spacing)
     is_marked = (places == marked).all(axis=1)
     is_neighbour = (np.abs(places - marked) <= 7.0).all(axis=1)
-    np.testing.assert_array_equal(_is_near(places + 0.5, is_marked, 7.0), is_neighbour)
+    np.testing.assert_array_equal(_is_near(places + 0.5, is_marked, size_mm=7.0), is_neighbour)
 
 
 POINTS_BESIDE_AN_L = {
@@ -283,4 +284,4 @@ POINTS_BESIDE_AN_L = {
 @pytest.mark.parametrize(("point", "is_near"), POINTS_BESIDE_AN_L.values(), ids=POINTS_BESIDE_AN_L)
 def test_a_point_is_near_a_line_within_2_mm_of_any_piece_or_end(point, is_near):
     line = np.array([[0.0, 0, 0], [10, 0, 0], [10, 10, 0]])
-    assert lie_near_line(np.array([point]), line, 2.0).tolist() == [is_near]
+    assert lie_near_line(np.array([point]), line, distance=2.0).tolist() == [is_near]

@@ -27,8 +27,8 @@ def joined_mesh(*shapes: samples.Arrays) -> Mesh:
 @pytest.fixture(scope="module")
 def sphere_and_torus():
     """A mesh of both, and the same with a fifth of its triangles."""
-    mesh = joined_mesh(samples.sphere(FAR, 20.0, 5), samples.torus(60, 24))
-    return mesh, collapse_quadric(mesh, 0.8)
+    mesh = joined_mesh(samples.sphere(FAR, radius=20.0, rounds=5), samples.torus(rings=60, sides=24))
+    return mesh, collapse_quadric(mesh, fraction=0.8)
 
 
 def test_collapsing_reaches_the_share_asked_for_and_reports_it(sphere_and_torus):
@@ -63,12 +63,12 @@ def test_the_largest_distance_of_a_collapsed_sphere_and_torus_is_reported(sphere
 @pytest.fixture(scope="module")
 def sphere_and_three_specks():
     """A sphere of 10 mm, and three specks 30 mm from it: only their vertices say how far away a result without is."""
-    specks = [samples.sphere((40.0, 4.0 * i, 0.0), 0.05, 0) for i in range(3)]
-    return joined_mesh(samples.sphere((0.0, 4.0, 0.0), 10.0, 5), *specks)
+    specks = [samples.sphere((40.0, 4.0 * i, 0.0), radius=0.05, rounds=0) for i in range(3)]
+    return joined_mesh(samples.sphere((0.0, 4.0, 0.0), radius=10.0, rounds=5), *specks)
 
 
 def test_components_that_a_collapse_loses_are_counted_and_fail_their_gate_with_a_warning(sphere_and_three_specks):
-    small = collapse_quadric(sphere_and_three_specks, 0.9)
+    small = collapse_quadric(sphere_and_three_specks, fraction=0.9)
     facts = small.report["refinement"]["quadric"]
     assert facts["topology"].components_lost == 4 - small.quality()["components"] == 3
     assert [gate.name for gate in facts["gates"] if not gate.ok] == ["components_lost"]
@@ -79,7 +79,7 @@ def test_components_that_a_collapse_loses_are_counted_and_fail_their_gate_with_a
 
 
 def test_edges_that_a_collapse_opens_are_counted_and_fail_their_gate_with_a_warning(sphere_and_three_specks):
-    small = collapse_quadric(sphere_and_three_specks, 0.7)
+    small = collapse_quadric(sphere_and_three_specks, fraction=0.7)
     facts, quality = small.report["refinement"]["quadric"], small.quality()
     loose_edges = quality["boundary_edges"] + quality["nonmanifold_edges"]
     assert facts["topology"].loose_edges_after == loose_edges > 0
@@ -91,14 +91,14 @@ def test_edges_that_a_collapse_opens_are_counted_and_fail_their_gate_with_a_warn
 
 
 def test_a_collapse_that_keeps_all_components_stays_near_the_surface(sphere_and_three_specks):
-    small = collapse_quadric(sphere_and_three_specks, 0.7)
+    small = collapse_quadric(sphere_and_three_specks, fraction=0.7)
     assert small.report["refinement"]["quadric"]["farthest_mm"] < 0.1  # measured 0.03; a speck lost is 30 mm away
 
 
 @pytest.fixture
 def two_spheres_and_a_torus():
     """The number of faces of each, all triangles, the component of each vertex, and the topology."""
-    parts = (samples.sphere(rounds=1), samples.sphere((30.0, 0, 0), 5.0, 1), samples.torus())
+    parts = (samples.sphere(rounds=1), samples.sphere((30.0, 0, 0), radius=5.0, rounds=1), samples.torus())
     vertices, triangles = samples.join(*parts)
     triangles = triangles.astype(np.uint32)
     count, labels = label_components(triangles, len(vertices))
@@ -123,7 +123,7 @@ def test_a_component_that_lost_a_triangle_is_changed_and_one_without_triangles_i
 
 
 def test_the_largest_distance_of_points_from_a_surface_is_exact():
-    vertices, triangles = samples.sphere(FAR, 20.0, 3)
+    vertices, triangles = samples.sphere(FAR, radius=20.0, rounds=3)
     points = FAR + np.random.default_rng(5).normal(0.0, 15.0, (500, 3))
     farthest = _farthest_point(points - FAR, vertices - FAR, triangles.astype(np.uint32))
     exact = SurfaceDistance(vertices, triangles.astype(np.uint32))(points)
@@ -132,6 +132,7 @@ def test_the_largest_distance_of_points_from_a_surface_is_exact():
 
 @pytest.fixture
 def two_boxes_and_a_lone_vertex():
+    """17 vertices: 0 to 7 and 8 to 15 of the boxes, which have 12 triangles each, and 16."""
     vertices, triangles = samples.join(samples.box(), samples.box())
     return Mesh(np.vstack((vertices, FAR)), triangles)
 
@@ -165,5 +166,5 @@ def test_collapsing_an_empty_mesh_is_refused():
 
 
 def test_a_collapse_that_leaves_nothing_is_refused():
-    with refused(NoSurfaceError, 12, 0.99):
+    with refused(NoSurfaceError, 12, 0.99):  # triangles
         collapse_quadric(Mesh(*samples.box()), 0.99)

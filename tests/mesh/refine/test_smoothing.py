@@ -34,7 +34,7 @@ RADIUS = 20.0
 
 def noisy_sphere(noise: float, seed: int = 1) -> Mesh:
     """A sphere of 20 mm with noise of its radius, in mm."""
-    vertices, triangles = samples.sphere((0, 0, 0), 1.0, 5)
+    vertices, triangles = samples.sphere((0, 0, 0), radius=1.0, rounds=5)
     lengths = RADIUS + np.random.default_rng(seed).normal(scale=noise, size=len(vertices))
     return Mesh(CENTRE + vertices * lengths[:, None], triangles, None, {"iso_value_hu": 300.0})
 
@@ -92,25 +92,26 @@ def test_report_of_a_smoothed_mesh_keeps_entries_and_has_the_default_number_of_i
 
 
 def test_more_iterations_smooth_more(rough_sphere):
-    after_5, after_20 = (np.std(radial_error(smooth_mesh(rough_sphere, count, 1.0))) for count in (5, 20))
+    after_5, after_20 = (
+        np.std(radial_error(smooth_mesh(rough_sphere, iterations=count, max_deviation_mm=1.0))) for count in (5, 20)
+    )
     assert after_20 < after_5 < NOISE_MM
 
 
 @pytest.fixture(scope="module", params=daily(1, [0.02, 0.1]), ids=lambda bound: f"{bound:g} mm")
 def bounded(request):
     """The bound, a sphere with noise of 0.2 mm, and the same smoothed within the bound."""
-    rough = noisy_sphere(0.2)
-    return request.param, rough, smooth_mesh(rough, 20, request.param)
+    bound_mm, rough = request.param, noisy_sphere(0.2)
+    return bound_mm, rough, smooth_mesh(rough, max_deviation_mm=bound_mm)
 
 
 @pytest.mark.release
 def test_a_noisy_sphere_that_is_smoothed_freely_moves_by_more_than_three_times_the_bound(bounded):
     bound, rough, _ = bounded
-    free = smooth_mesh(rough, 20, 10.0)
+    free = smooth_mesh(rough, max_deviation_mm=10.0)
     assert free.report["refinement"]["smooth"]["vertices_held_back"] == 0
-    assert (
-        SurfaceDistance(rough.vertices, rough.triangles)(free.vertices.astype(float)).max() > 3 * bound
-    )  # measured 0.51
+    moved_mm = SurfaceDistance(rough.vertices, rough.triangles)(free.vertices.astype(float)).max()
+    assert moved_mm > 3 * bound  # measured 0.51
 
 
 @pytest.mark.release
@@ -157,7 +158,7 @@ def test_the_filter_alone_moves_a_sheet_through_another(sheets_that_nearly_touch
 
 
 def test_vertices_are_taken_back_so_that_smoothed_sheets_do_not_cut_each_other(sheets_that_nearly_touch):
-    smooth = smooth_mesh(sheets_that_nearly_touch, 20, 1.0)
+    smooth = smooth_mesh(sheets_that_nearly_touch, max_deviation_mm=1.0)
     taken_back = smooth.report["refinement"]["smooth"]["vertices_taken_back"]
     assert count_crossings(smooth.vertices, smooth) == 0
     assert 0 < taken_back < 0.2 * smooth.vertex_count  # those beside the peak
@@ -168,34 +169,35 @@ def test_a_thin_shell_keeps_its_volume():
     outer, inner = noisy_sphere(0.05), noisy_sphere(0.05, seed=2)
     shrunken = CENTRE + (inner.vertices - CENTRE) * ((RADIUS - 0.3) / RADIUS)
     mesh = Mesh(*samples.join((outer.vertices, outer.triangles), (shrunken, inner.triangles[:, ::-1])))
-    smooth = smooth_mesh(mesh, 20, 0.3)
+    smooth = smooth_mesh(mesh, max_deviation_mm=0.3)
     assert smooth.volume == pytest.approx(mesh.volume, rel=tolerances.SHELL_VOLUME)
 
 
 def test_smoothing_joins_no_vertices_where_float32_is_coarse():
     """A sphere of 2 micrometres 1400 mm from the origin: STL would join vertices at one place, and be open."""
-    mesh = Mesh(*samples.sphere((800.0, -790.0, 805.0), 2.0**-9, 3))
-    smooth = smooth_mesh(mesh, 100, 1.0)
+    mesh = Mesh(*samples.sphere((800.0, -790.0, 805.0), radius=2.0**-9, rounds=3))
+    smooth = smooth_mesh(mesh, iterations=100, max_deviation_mm=1.0)
     assert len(find_coincident(smooth.vertices)) <= len(find_coincident(mesh.vertices))
 
 
 def test_a_noisy_plane_is_flattened_and_its_border_stays():
     rough = noisy_plane(0.1)
-    smooth = smooth_mesh(rough, 40, 1.0)
+    smooth = smooth_mesh(rough, iterations=40, max_deviation_mm=1.0)
     x_y = rough.vertices[:, :2]
-    border = np.isin(x_y, (0.0, 29.0)).any(axis=1)
+    border = np.isin(x_y, (0.0, 29.0)).any(axis=1)  # of 30 x 30 vertices
     inner = ((x_y > 6) & (x_y < 23)).all(axis=1)
     np.testing.assert_array_equal(smooth.vertices[border], rough.vertices[border])
     assert np.std(smooth.vertices[inner, 2]) < tolerances.SMOOTHED_NOISE_SHARE * np.std(rough.vertices[inner, 2])
 
 
 def test_a_flat_plane_stays_flat():
-    assert smooth_mesh(noisy_plane(0.0), 20, 1.0).vertices[:, 2].tolist() == [0.0] * 30**2
+    flat = smooth_mesh(noisy_plane(0.0, size=30), max_deviation_mm=1.0)
+    assert flat.vertices[:, 2].tolist() == [0.0] * 30**2
 
 
 def test_a_torus_keeps_its_volume_and_its_handle():
-    torus = Mesh(*samples.torus(120, 48))
-    quality = smooth_mesh(torus, 20, 1.0).quality()
+    torus = Mesh(*samples.torus(rings=120, sides=48))
+    quality = smooth_mesh(torus, max_deviation_mm=1.0).quality()
     assert quality["volume_ml"] == pytest.approx(torus.quality()["volume_ml"], rel=tolerances.SMOOTHED_VOLUME)
     assert quality["genus"] == 1
 
@@ -233,7 +235,7 @@ def test_only_vertices_at_a_fault_are_taken_back_by_half_a_step_at_first():
     vertices, triangles = samples.box()
     step = np.zeros((8, 3))
     step[0] = (1.0, 0.0, 0.0)
-    step[7] = 0.125
+    step[7] = 0.125  # the corner (1, 1, 1)
     moved, taken_back = move_vertices(vertices.astype(np.float32), triangles.astype(np.uint32), step)
     assert moved[0].tolist() == [0.5, 0.0, 0.0]
     assert moved[7].tolist() == [1.125, 1.125, 1.125]
@@ -243,18 +245,18 @@ def test_only_vertices_at_a_fault_are_taken_back_by_half_a_step_at_first():
 @pytest.mark.parametrize("iterations", [0, -1, 1001, 20.0])
 def test_iterations_that_are_no_whole_number_from_1_to_1000_are_refused(iterations):
     with refused(UsageError, 1, 1000):
-        smooth_mesh(noisy_sphere(0.1), iterations, 1.0)
+        smooth_mesh(noisy_sphere(0.1), iterations, max_deviation_mm=1.0)
 
 
 @pytest.mark.parametrize("bound", [0.0, -1.0, float("nan"), float("inf")])
 def test_bounds_that_are_no_finite_length_above_0_are_refused(bound):
     with refused(UsageError, "length", 0):
-        smooth_mesh(noisy_sphere(0.1), 20, bound)
+        smooth_mesh(noisy_sphere(0.1), max_deviation_mm=bound)
 
 
 def test_smoothing_an_empty_mesh_is_refused():
     with refused(NoSurfaceError, "nothing", "refine"):
-        smooth_mesh(Mesh([], []), 20, 1.0)
+        smooth_mesh(Mesh([], []), max_deviation_mm=1.0)
 
 
 def test_normals_at_corners_of_a_box_lie_along_its_diagonals_however_its_faces_are_cut():
@@ -302,8 +304,8 @@ def move_by_looking_at_all(vertices, triangles, step):
 def shells_with_wild_steps(request):
     """Vertices, triangles and steps: two shells in each other and a sphere, a flat triangle, vertices at one place."""
     random = np.random.default_rng(request.param)
-    shells = [samples.sphere((0, 0, 0), radius, 5) for radius in (10.0, 10.4)]
-    vertices, triangles = samples.join(*shells, samples.sphere((25, 0, 0), 10.0, 5))
+    shells = [samples.sphere((0, 0, 0), radius=radius, rounds=5) for radius in (10.0, 10.4)]
+    vertices, triangles = samples.join(*shells, samples.sphere((25, 0, 0), radius=10.0, rounds=5))
     vertices, triangles = vertices.astype(np.float32), triangles.astype(np.uint32)
     vertices[triangles[50, 1]] = vertices[triangles[50, 0]]
     vertices[-1] = vertices[7]
@@ -354,8 +356,11 @@ def test_vertices_that_would_stop_in_the_way_back_of_others_are_taken_back_again
 
 def test_smoothing_tells_its_three_steps():
     steps = []
-    smooth_mesh(Mesh(*samples.sphere()), 5, 1.0, progress=lambda *step: steps.append(step))
+    smooth_mesh(Mesh(*samples.sphere()), iterations=5, max_deviation_mm=1.0, progress=lambda *step: steps.append(step))
     assert steps == [("smooth", done, 3) for done in range(4)]
+
+
+SPECK_BOUND_MM = 0.25
 
 
 @pytest.fixture(scope="module", params=[1, 20, 100, 1000], ids=lambda count: f"{count} iterations")
@@ -364,15 +369,17 @@ def speck(request):
     corners = np.concatenate([np.eye(3), -np.eye(3)]) * [0.11, 0.2, 0.3] + [50.0, 0.0, 0.0]
     faces = [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]]
     alone = Mesh(corners, faces)
-    beside_a_sphere = Mesh(*samples.join((corners, np.array(faces)), samples.sphere((0, 0, 0), RADIUS, 3)))
-    return [(mesh, smooth_mesh(mesh, request.param, 0.25)) for mesh in (alone, beside_a_sphere)]
+    beside_a_sphere = Mesh(
+        *samples.join((corners, np.array(faces)), samples.sphere((0, 0, 0), radius=RADIUS, rounds=3))
+    )
+    return [(mesh, smooth_mesh(mesh, request.param, SPECK_BOUND_MM)) for mesh in (alone, beside_a_sphere)]
 
 
 @pytest.mark.parametrize("which", [0, 1], ids=["alone", "beside a sphere"])
 def test_a_speck_that_the_filter_draws_into_a_point_keeps_its_volume_within_the_bound(speck, which):
     rough, smooth = speck[which]
     step = smooth.vertices.astype(float) - rough.vertices
-    assert np.linalg.norm(step, axis=1).max() <= 0.25  # which no NaN is
+    assert np.linalg.norm(step, axis=1).max() <= SPECK_BOUND_MM  # which no NaN is
     assert smooth.volume == pytest.approx(rough.volume, rel=tolerances.PEER_MEASURE)
     assert smooth.report["refinement"]["smooth"]["components_left"] == 0
 
@@ -383,15 +390,16 @@ def test_a_speck_is_smoothed_alone_as_beside_a_sphere(speck):
 
 
 def test_a_sphere_beside_a_speck_is_smoothed(speck):
-    rough, smooth = speck[1]
-    assert not np.array_equal(smooth.vertices[6:], rough.vertices[6:])
+    _, (rough, smooth) = speck
+    first_of_the_sphere = 6  # behind the corners of the octahedron
+    assert not np.array_equal(smooth.vertices[first_of_the_sphere:], rough.vertices[first_of_the_sphere:])
 
 
 def test_a_component_is_left_as_it_was_or_keeps_its_volume_where_the_bound_leaves_little_room():
     """A tetrahedron of a hundredth of the bound: half of it beyond the room that its sharp corners leave."""
     faces = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]
     flat = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.3, 0.3, 1e-4]], faces)
-    smooth = smooth_mesh(flat, 20, 0.01)
+    smooth = smooth_mesh(flat, max_deviation_mm=0.01)
     left = smooth.report["refinement"]["smooth"]["components_left"]
     assert left == np.array_equal(smooth.vertices, flat.vertices)
     assert smooth.volume == pytest.approx(flat.volume, rel=tolerances.SMOOTHED_VOLUME)
@@ -451,7 +459,7 @@ def test_the_filter_damps_the_shortest_wave_and_removes_it_from_20_iterations_on
 
 @pytest.fixture
 def sphere_triangles():
-    vertices, triangles = samples.sphere((0, 0, 0), 1.0, 3)
+    vertices, triangles = samples.sphere((0, 0, 0), radius=1.0, rounds=3)
     return len(vertices), triangles.astype(np.uint32)
 
 
