@@ -50,9 +50,12 @@ class Renders:
         report: dict[str, Any] = json.loads(self.capsys.readouterr().out)
         return report
 
-    def __call__(self, *arguments: object, name: str = "a.png") -> tuple[np.ndarray, dict[str, Any]]:
-        report = self.report("-o", self.folder / name, *arguments)
-        return np.asarray(Image.open(self.folder / name)), report
+    def __call__(self, *arguments: object) -> tuple[np.ndarray, dict[str, Any]]:
+        report = self.report("-o", self.folder / "a.png", *arguments)
+        return np.asarray(Image.open(self.folder / "a.png")), report
+
+    def image(self, *arguments: object) -> np.ndarray:
+        return self(*arguments)[0]
 
 
 @pytest.fixture
@@ -127,7 +130,7 @@ def test_several_views_are_written_to_files_named_after_them(render: Renders) ->
 
 
 def test_zoom_of_2_magnifies_the_block_about_four_times_in_area(render: Renders) -> None:
-    small, large = (is_lit(render("--zoom", zoom)[0]).sum() for zoom in (0.5, 1.0))
+    small, large = (is_lit(render.image("--zoom", zoom)).sum() for zoom in (0.5, 1.0))
     assert 3.0 < large / small < 5.0  # 2 * 2, with pixels at the rim: measured 174 / 41
 
 
@@ -135,7 +138,7 @@ def test_zoom_of_2_magnifies_the_block_about_four_times_in_area(render: Renders)
     ("up", "place"), [("left", ("left", "top")), ("0,0,-1", ("left", "bottom"))], ids=["the patient's left", "the feet"]
 )
 def test_option_up_turns_the_picture(up: str, place: tuple[str, str], render: Renders) -> None:
-    assert side_of(is_lit(render("--up", up)[0])) == place
+    assert side_of(is_lit(render.image("--up", up))) == place
 
 
 def test_size_and_perspective_are_those_of_the_picture_and_its_camera(render: Renders) -> None:
@@ -148,7 +151,8 @@ def test_size_and_perspective_are_those_of_the_picture_and_its_camera(render: Re
 
 
 def test_perspective_without_a_number_has_an_angle_of_30_degrees(render: Renders) -> None:
-    assert render("--perspective")[1]["pictures"][0]["camera"]["view_angle_deg"] == 30.0
+    _, report = render("--perspective")
+    assert report["pictures"][0]["camera"]["view_angle_deg"] == 30.0
 
 
 @pytest.mark.parametrize(
@@ -171,7 +175,8 @@ def test_transparent_background_is_seen_through_beside_an_opaque_block(render: R
     assert image[..., 3].max() > 200  # of 255; measured 254
 
 
-MIDDLE_OF_BLOCK_X, BESIDE_BLOCK_X = lps((24.5, 25, 17))[0], lps((21.5, -0.5, -0.5))[0]
+MIDDLE_OF_BLOCK_X, *_ = lps((24.5, 0, 0))
+BESIDE_BLOCK_X, *_ = lps((21.5, 0, 0))
 
 
 def test_clip_box_and_clip_plane_leave_a_half_of_the_block_each(render: Renders) -> None:
@@ -213,7 +218,7 @@ def test_light_from_above_is_reported_with_its_direction_and_changes_the_picture
 
 
 def test_depth_cue_darkens_the_surface_and_brightens_nothing(render: Renders) -> None:
-    plain, cued = (render("--iso", ISO, *extra)[0].astype(int) for extra in ([], ["--depth-cue", "0.6"]))
+    plain, cued = (render.image("--iso", ISO, *extra).astype(int) for extra in ([], ["--depth-cue", "0.6"]))
     assert (cued <= plain).all()
     assert cued[is_lit(plain)].mean() < 0.95 * plain[is_lit(plain)].mean()  # measured 0.948; without a cue it is 1
 
@@ -226,7 +231,7 @@ def test_shadows_darken_a_part_of_the_floor_and_brighten_nothing(
     voxels[10:13, 8:17, 10:21] = BLOCK_HU
     render = Renders(write_series(tmp_path / "ct", voxels), tmp_path, device, capsys)
     plain, dark = (
-        render("--iso", ISO, "--view", "superior", "--light", "0.5,0,1", *extra)[0].astype(int)
+        render.image("--iso", ISO, "--view", "superior", "--light", "0.5,0,1", *extra).astype(int)
         for extra in ([], ["--shadows"])
     )
     assert (dark <= plain).all()
@@ -267,7 +272,7 @@ def test_depth_file_holds_the_mm_from_the_camera_to_the_surface(render: Renders)
 
     depth = np.load(render.folder / "d.npy")
     assert (depth.dtype, depth.shape) == (np.float32, (SIDE, SIDE))
-    front = lps((0, 2.5, 0))[1]  # ISO lies half way between air and the block, between voxels 2 and 3
+    _, front, _ = lps((0, 2.5, 0))  # ISO lies half way between air and the block, between voxels 2 and 3
     camera = report["pictures"][0]["camera"]["position_lps_mm"][1]
     assert float(np.nanmedian(depth)) == pytest.approx(front - camera, abs=0.02)  # crossings sought along the ray
 
@@ -288,7 +293,7 @@ def test_depths_in_a_tif_file_are_those_in_an_npy_file(render: Renders) -> None:
 def test_slab_of_a_slice_is_combined_by_mean_maximum_or_minimum(
     combine: str, low_hu: int, high_hu: int, render: Renders
 ) -> None:
-    to_the_block = lps((0, 5.5, 0))[1] - lps((0, 12, 0))[1]
+    _, to_the_block, _ = lps((0, 5.5, 0)) - lps((0, 12, 0))  # from the middle of the volume
     thicker_than_the_block = 12.0
     slab = ("--offset", to_the_block, "--thickness", thicker_than_the_block, "--combine", combine)
 
@@ -307,7 +312,8 @@ def test_curve_of_a_file_is_straightened_or_stretched_at_its_length(kind: str, r
     assert (report["mode"], report["pictures"][0]["curve"]["kind"]) == ("cpr", kind)
     assert report["pictures"][0]["curve"]["length_mm"] == pytest.approx(14 * SPACING[2])
     assert report["pictures"][0]["camera"] is None
-    assert side_of(is_lit(image))[1] == "top"
+    _, end = side_of(is_lit(image))
+    assert end == "top"
 
 
 def test_transfer_function_of_a_file_colours_the_picture(render: Renders) -> None:
@@ -364,20 +370,20 @@ def test_label_has_the_given_colour(render: Renders, label_20: Path, mode: list[
 
 @pytest.mark.seconds
 def test_label_of_opacity_0_darkens_pixels_that_it_lit(render: Renders, label_20: Path) -> None:
-    shown = is_lit(render("--labels", label_20)[0])
-    assert not is_lit(render("--labels", label_20, "--label-opacity", "20=0")[0])[shown].all()
+    shown = is_lit(render.image("--labels", label_20))
+    assert not is_lit(render.image("--labels", label_20, "--label-opacity", "20=0"))[shown].all()
 
 
 @pytest.mark.seconds
 def test_label_of_opacity_0_3_is_fainter_than_an_opaque_one(render: Renders, label_20: Path) -> None:
     surface = ("--iso", ISO, "--light", "none", "--labels", label_20, "--label-color", "20=blue")
-    whole, faint = render(*surface)[0], render(*surface, "--label-opacity", "20=0.3")[0]
+    whole, faint = render.image(*surface), render.image(*surface, "--label-opacity", "20=0.3")
     assert faint[is_lit(whole)][:, 2].mean() < 0.8 * whole[is_lit(whole)][:, 2].mean()  # measured 0.298
 
 
 @pytest.mark.seconds
 def test_surface_has_the_given_colour(render: Renders) -> None:
-    image = render("--iso", ISO, "--light", "none", "--color", "red")[0]
+    image = render.image("--iso", ISO, "--light", "none", "--color", "red")
     assert image[..., :3][is_lit(image)].mean(axis=0).tolist() == [255.0, 0.0, 0.0]
 
 
@@ -408,7 +414,8 @@ def test_turntable_into_a_folder_has_frames_from_all_sides(render: Renders) -> N
     names = sorted(path.name for path in (render.folder / "frames").iterdir())
     assert names == [f"frame_{number:04d}.png" for number in range(4)]
     front, _, back, _ = (np.asarray(Image.open(render.folder / "frames" / name)) for name in names)
-    assert (side_of(is_lit(front))[0], side_of(is_lit(back))[0]) == ("right", "left")
+    (side_in_front, _), (side_behind, _) = side_of(is_lit(front)), side_of(is_lit(back))
+    assert (side_in_front, side_behind) == ("right", "left")
 
 
 def test_picture_within_little_memory_is_that_of_the_whole_volume(render: Renders) -> None:
@@ -421,7 +428,7 @@ def test_picture_within_little_memory_is_that_of_the_whole_volume(render: Render
 
 
 def test_voxels_outside_the_field_of_view_are_masked_before_rendering(render: Renders) -> None:
-    report = render("--fov", "5")[1]
+    _, report = render("--fov", "5")
     assert report["pictures"][0]["hit_share"] == 0.0
     assert report["volume"]["field_of_view"]["radius_mm"] == 5.0
     assert any("outside of 5 mm" in warning for warning in report["warnings"])
@@ -457,7 +464,7 @@ def test_files_and_words_of_render_do_not_name_the_patient(render: Renders) -> N
 def test_picture_of_skin_alone_is_warned_of_as_one_that_can_show_a_face(
     preset: str, warns: bool, render: Renders
 ) -> None:
-    report = render("--preset", preset)[1]
+    _, report = render("--preset", preset)
     assert any("can show a face" in warning for warning in report["warnings"]) == warns
 
 

@@ -43,7 +43,7 @@ def make_cloud(n: int = 1000, *, bare: bool = False, far: bool = False) -> Point
     normals = chance.normal(size=(n, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     hu = chance.integers(-1024, 3071, n) + 0.5
-    return PointCloud(points, normals, hu, np.arange(n) % 70000 - 1, None, dict(REPORT))
+    return PointCloud(points, normals, hu, labels=np.arange(n) % 70000 - 1, report=dict(REPORT))
 
 
 def assert_same_cloud(read: PointCloud, cloud: PointCloud, extension: str) -> None:
@@ -208,7 +208,7 @@ def test_pyvista_reads_hu_labels_frame_and_certificate_of_a_vtp_cloud(tmp_path):
     np.testing.assert_array_equal(read.point_data["HU"], cloud.hu)
     np.testing.assert_array_equal(read.point_data["label"], cloud.labels)
     assert list(read.field_data["SPACE"]) == ["RAS"]
-    assert list(read.field_data["CERTIFICATE"])[0] == "tilt_deg 18.5"
+    assert list(read.field_data["CERTIFICATE"]) == ["tilt_deg 18.5", "warning one"]
 
 
 def test_each_point_of_a_vtp_cloud_is_a_vertex_cell(tmp_path):
@@ -455,7 +455,7 @@ def test_cloud_file_that_fails_its_check_leaves_the_older_one(extension, tmp_pat
 
 @pytest.fixture(scope="module", params=EXTENSIONS)
 def large_cloud_file(request, tmp_path_factory):
-    """A cloud of more points than two of the pieces that writers work in, and its file."""
+    """A cloud of more points than two of the pieces that writers work in, of 16,384 rows, and its file."""
     cloud = make_cloud(40_000)
     path = tmp_path_factory.mktemp("large") / f"bone{request.param}"
     cloud.save(path)

@@ -35,8 +35,8 @@ REMARKS = ["SPACE=LPS", "UNIT=mm", "ISO_VALUE_HU=249.5"]
 @pytest.fixture(params=[True, False], ids=["normals", "bare"])
 def mesh(request) -> Mesh:
     """An oblique torus beside a sphere, far from the origin, one coordinate exactly 0, no vertex unused."""
-    vertices, triangles = samples.join(samples.torus(), samples.sphere((40.3, 1.1, 5.7), 3.3))
-    oblique = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
+    vertices, triangles = samples.join(samples.torus(), samples.sphere(centre=(40.3, 1.1, 5.7), radius=3.3))
+    oblique, _ = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))
     oblique *= np.sign(np.linalg.det(oblique))
     vertices = vertices @ oblique.T + (-169.4, 165.01, -846.25)
     vertices[5, 1] = 0.0
@@ -215,7 +215,8 @@ def test_obj_begins_with_frame_unit_and_iso_value(mesh, tmp_path):
 def test_obj_has_every_digit_of_float32_and_no_negative_zero(mesh, tmp_path):
     lines = [line for line in read_obj_lines(mesh, tmp_path / "bone.obj", "ras") if line.startswith("v ")]
     read = np.array([line.split()[1:] for line in lines], dtype=np.float32)
-    np.testing.assert_array_equal(read, mesh.in_space("ras")[0])
+    vertices, _ = mesh.in_space("ras")
+    np.testing.assert_array_equal(read, vertices)
     assert not any("-0" in line.split() for line in lines)  # one coordinate is 0, and its sign turns in RAS
 
 
@@ -299,7 +300,7 @@ def test_buffer_of_a_glb_holds_vertices_and_normals_of_its_frame_as_they_are(mes
 @pytest.mark.parametrize("space", ["lps", "ras"])
 def test_positions_of_a_glb_have_their_bounds(mesh, space, tmp_path):
     positions = save_glb(mesh, tmp_path / "bone.glb", space).document["accessors"][0]
-    vertices = mesh.in_space(space)[0]
+    vertices, _ = mesh.in_space(space)
     assert positions["min"] == vertices.min(axis=0).tolist()
     assert positions["max"] == vertices.max(axis=0).tolist()
 
@@ -469,7 +470,7 @@ def test_mesh_file_that_fails_its_check_leaves_the_older_one(mesh, extension, tm
 
 @pytest.mark.parametrize("extension", EXTENSIONS)
 def test_estimated_size_of_a_mesh_file_is_near_the_true_one(extension, tmp_path):
-    mesh = Mesh(*samples.torus(200, 100))
+    mesh = Mesh(*samples.torus(rings=200, sides=100))
     size = mesh.save(tmp_path / f"bone{extension}")
     estimate = FORMATS[extension].code.estimate(mesh.describe("lps"))
     assert tolerances.ESTIMATE_LOW * size <= estimate <= tolerances.ESTIMATE_HIGH * size
@@ -477,14 +478,14 @@ def test_estimated_size_of_a_mesh_file_is_near_the_true_one(extension, tmp_path)
 
 @pytest.mark.parametrize("extension", [".stl", ".ply", ".glb"])
 def test_estimated_size_of_a_binary_mesh_file_is_the_true_one(extension, tmp_path):
-    mesh = Mesh(*samples.torus(200, 100))
+    mesh = Mesh(*samples.torus(rings=200, sides=100))
     size = mesh.save(tmp_path / f"bone{extension}")
     assert FORMATS[extension].code.estimate(mesh.describe("lps")) == size
 
 
 def test_estimated_size_of_a_3mf_grows_with_the_text_of_its_triangles():
     """A triangle of five digits an index has 45 bytes; 6 are taken for it besides.  XML shrinks to a seventh."""
-    vertices, triangles = samples.torus(200, 100)
+    vertices, triangles = samples.torus(rings=200, sides=100)
     estimate = FORMATS[".3mf"].code.estimate
     of_7000, of_14000 = (estimate(Mesh(vertices, triangles[:count]).describe("lps")) for count in (7_000, 14_000))
     bytes_a_triangle = len('<triangle v1="19999" v2="19999" v3="19999"/>\n') + 6
@@ -523,7 +524,7 @@ def test_formats_that_count_in_32_bits_hold_at_most_4_gib(extension):
 @pytest.mark.parametrize("extension", [".stl", ".ply", ".obj", ".vtp"])
 def test_mesh_larger_than_the_pieces_that_writers_work_in_is_written_whole(extension, tmp_path):
     pyvista = pytest.importorskip("pyvista")
-    mesh = Mesh(*samples.torus(301, 113))
+    mesh = Mesh(*samples.torus(rings=301, sides=113))  # 34,013 vertices: more than two pieces of 16,384 rows
     mesh.save(tmp_path / f"bone{extension}")
     polydata = pyvista.read(tmp_path / f"bone{extension}")
     corners = np.float32(polydata.points)[polydata.regular_faces]
@@ -533,10 +534,11 @@ def test_mesh_larger_than_the_pieces_that_writers_work_in_is_written_whole(exten
 @pytest.fixture(scope="module")
 def far_sphere(tmp_path_factory):
     """A sphere of 0.02 mm 100 m from the origin, where steps of float32 are 0.008 mm; and its corners in an STL."""
-    mesh = Mesh(*samples.sphere((1e5, -9e4, 8e4), 0.02, 3))
+    mesh = Mesh(*samples.sphere(centre=(1e5, -9e4, 8e4), radius=0.02, rounds=3))
     path = tmp_path_factory.mktemp("far") / "far.stl"
     mesh.save(path)
-    return mesh, read_stl(path)[2]["floats"][:, 1:].reshape(-1, 3)
+    _, _, facets = read_stl(path)
+    return mesh, facets["floats"][:, 1:].reshape(-1, 3)
 
 
 def test_stl_keeps_vertices_apart_that_float32_would_bring_together(far_sphere):

@@ -168,7 +168,7 @@ def test_vtp_in_every_encoding_of_vtk_is_read(tmp_path: Path, mode: str) -> None
     pyvista = pytest.importorskip("pyvista")
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
-    mesh = Mesh(*ball(8.0, 12))
+    mesh = Mesh(*ball(radius=8.0, rings=12))
     writer = vtkXMLPolyDataWriter()
     writer.SetInputData(pyvista.PolyData.from_regular_faces(mesh.vertices, mesh.triangles.astype(np.int64)))
     writer.SetFileName(str(tmp_path / "a.vtp"))
@@ -194,9 +194,9 @@ def test_normals_of_a_mesh_saved_in_ras_are_read_back_in_lps(tmp_path: Path, ext
 @pytest.fixture(scope="module", params=[".obj", ".glb", ".3mf", ".vtp"])
 def assembly(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Mesh], Mesh]:
     """Three balls with names and colours, and the mesh that is read from the file of all, in RAS."""
-    vertices, triangles = ball(5.0, 6)
+    vertices, triangles = ball(radius=5.0, rings=6)
     meshes = [
-        Mesh(vertices + 20.0 * n, triangles, None, {"part_name": f"L{n}", "color": (1.0, 0.2 * n, 0.0)})
+        Mesh(vertices + 20.0 * n, triangles, report={"part_name": f"L{n}", "color": (1.0, 0.2 * n, 0.0)})
         for n in (1, 2, 3)
     ]
     path = tmp_path_factory.mktemp("assembly") / f"all{request.param}"
@@ -241,7 +241,7 @@ def test_text_stl_with_odd_letters_and_line_ends_is_read(tmp_path: Path, text: s
 
 @pytest.mark.seconds
 def test_distances_of_a_mesh_with_a_facet_without_area_are_those_without_it(tmp_path: Path) -> None:
-    vertices, triangles = ball(8.0, 12)
+    vertices, triangles = ball(radius=8.0, rings=12)
     Mesh(vertices, np.vstack([triangles, [(0, 0, 0)]])).save(tmp_path / "a.stl")
     distance = clrecon.measure_distance(clrecon.read_mesh(tmp_path / "a.stl"), Mesh(vertices, triangles))
     assert distance.hausdorff_mm < tolerances.SAME_SURFACE_MM
@@ -380,7 +380,7 @@ def test_mesh_file_cut_anywhere_is_refused_unless_it_is_an_obj_cut_between_lines
 ) -> None:
     """Nothing tells that an OBJ was cut between two lines; the last bytes of VTP are no data, and are not cut here."""
     whole = tmp_path / f"whole{extension}"
-    Mesh(*ball(5.0, 6)).save(whole)
+    Mesh(*ball(radius=5.0, rings=6)).save(whole)
     data, cut = whole.read_bytes(), tmp_path / f"cut{extension}"
     refusals = 0
     for length in np.linspace(0, len(data) - 60, 40).astype(int):
@@ -399,7 +399,7 @@ def test_mesh_file_cut_anywhere_is_refused_unless_it_is_an_obj_cut_between_lines
     ("name", "member"), [("a.3mf", b"3D/3dmodel.model"), ("a.npz", b"points.npy")], ids=["3MF", "NPZ"]
 )
 def test_file_whose_packed_bytes_are_overwritten_is_refused(name: str, member: bytes, tmp_path: Path) -> None:
-    vertices, triangles = ball(5.0, 6)
+    vertices, triangles = ball(radius=5.0, rings=6)
     path = tmp_path / name
     if name == "a.3mf":
         Mesh(vertices, triangles).save(path)

@@ -100,7 +100,7 @@ def test_coded_surface_that_was_harmed_is_refused(harmed):
 
 def cubes(count: int) -> Mesh:
     """Cubes with edges of 10, 11, 12 ... mm beside each other, the smallest first."""
-    arrays = [samples.box((40.0 * n, 0, 0), (10.0 + n,) * 3) for n in range(count)]
+    arrays = [samples.box(low=(40.0 * n, 0, 0), size=(10.0 + n,) * 3) for n in range(count)]
     return Mesh(*samples.join(*arrays), report={"iso_value_hu": 300.0})
 
 
@@ -110,7 +110,8 @@ CUBES_ML = [1.0, 1.331, 1.728]
 
 def test_components_of_a_page_are_parts_with_the_largest_first(tmp_path):
     cubes(3).save(tmp_path / "page.html")
-    parts = read_page(tmp_path / "page.html")[0]["parts"]
+    facts, *_ = read_page(tmp_path / "page.html")
+    parts = facts["parts"]
     assert [(part["name"], part["first"], part["count"]) for part in parts] == [
         ("part 1", 0, 12), ("part 2", 12, 12), ("part 3", 24, 12),
     ]  # fmt: skip
@@ -128,7 +129,7 @@ def test_triangles_of_each_part_of_a_page_are_those_of_its_component(tmp_path):
 
 def test_page_says_iso_value_rounding_and_that_there_is_no_certificate(tmp_path):
     cubes(1).save(tmp_path / "page.html")
-    facts = read_page(tmp_path / "page.html")[0]
+    facts, *_ = read_page(tmp_path / "page.html")
     iso_value, rounding, certificate = facts["about"][:3]
     assert iso_value == "Surface: iso value 300 HU."
     assert f"moved by at most {facts['half_step_mm']:.2g} mm" in rounding
@@ -137,7 +138,8 @@ def test_page_says_iso_value_rounding_and_that_there_is_no_certificate(tmp_path)
 
 def test_components_beyond_the_most_parts_of_a_page_are_one_part(tmp_path):
     cubes(MOST_PARTS + 3).save(tmp_path / "page.html")
-    parts = read_page(tmp_path / "page.html")[0]["parts"]
+    facts, *_ = read_page(tmp_path / "page.html")
+    parts = facts["parts"]
     assert len(parts) == MOST_PARTS + 1
     assert [part["name"] for part in parts[-2:]] == [f"part {MOST_PARTS}", "3 smaller parts"]
     assert parts[-1]["count"] == 3 * 12
@@ -147,14 +149,15 @@ def test_components_beyond_the_most_parts_of_a_page_are_one_part(tmp_path):
 @pytest.fixture
 def page_of_two_meshes(tmp_path):
     """A page in RAS of a box "L1" of 6 ml, orange, and of two cubes without name and colour."""
-    box = Mesh(*samples.box((0, 0, 0), (10, 20, 30)), report={"part_name": "L1", "color": (1.0, 0.5, 0.0)})
+    box = Mesh(*samples.box(size=(10, 20, 30)), report={"part_name": "L1", "color": (1.0, 0.5, 0.0)})
     with stage_assembly([box, cubes(2)], tmp_path / "page.html", "ras") as staged:
         staged.commit()
     return read_page(tmp_path / "page.html")
 
 
 def test_meshes_of_a_page_are_parts_with_their_names_colours_and_volumes(page_of_two_meshes):
-    parts = page_of_two_meshes[0]["parts"]
+    facts, *_ = page_of_two_meshes
+    parts = facts["parts"]
     assert [part["name"] for part in parts] == ["L1", "surface 2"]
     assert [part["color"] for part in parts] == ["#ff8000", "#e3dbc7"]  # the second is that of bone
     assert [part["ml"] for part in parts] == pytest.approx([6.0, CUBES_ML[0] + CUBES_ML[1]])
@@ -196,7 +199,8 @@ def test_name_of_a_part_is_text_in_a_page_and_adds_no_script(name, tmp_path):
     mesh.save(tmp_path / "page.html")
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert page.count("<script") == page.count("</script>") == 3  # facts, surface and the script itself
-    assert read_page(tmp_path / "page.html")[0]["parts"][0]["name"] == name
+    facts, *_ = read_page(tmp_path / "page.html")
+    assert [part["name"] for part in facts["parts"]] == [name]
 
 
 def test_page_of_more_than_the_most_triangles_is_refused_and_nothing_is_written(tmp_path, monkeypatch):

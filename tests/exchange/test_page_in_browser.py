@@ -29,7 +29,7 @@ def browser():
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
-    sphere = samples.sphere(tuple(CENTRE), RADIUS, 5)
+    sphere = samples.sphere(tuple(CENTRE), RADIUS, rounds=5)
     path = tmp_path_factory.mktemp("page") / "page.html"
     mesh = Mesh(*samples.join(sphere, samples.box(tuple(BOX_CORNER), BOX_SIZE)), report={"iso_value_hu": 300.0})
     mesh.save(path)
@@ -116,7 +116,7 @@ def test_page_tells_the_iso_value_and_shows_no_message(page):
 
 def test_part_that_is_switched_off_vanishes_from_its_side(page):
     both = draw_page(page)
-    box_is_shown = page.find_elements("css selector", "#parts input[type=checkbox]")[1]
+    _, box_is_shown = page.find_elements("css selector", "#parts input[type=checkbox]")
 
     box_is_shown.click()
     changed = changed_pixels(draw_page(page), both)
@@ -127,7 +127,7 @@ def test_part_that_is_switched_off_vanishes_from_its_side(page):
 
 def test_part_that_is_switched_on_again_comes_back(page):
     both = draw_page(page)
-    box_is_shown = page.find_elements("css selector", "#parts input[type=checkbox]")[1]
+    _, box_is_shown = page.find_elements("css selector", "#parts input[type=checkbox]")
 
     box_is_shown.click()
     box_is_shown.click()
@@ -170,7 +170,7 @@ def test_each_of_the_six_views_has_its_sides_up_down_left_and_right(page, letter
 
 
 def test_distance_between_two_clicks_on_the_sphere_is_that_of_its_points(page):
-    first, second = sphere_point(-0.6, -0.3), sphere_point(0.5, 0.55)
+    first, second = sphere_point(left=-0.6, up=-0.3), sphere_point(left=0.5, up=0.55)
     page.find_element("id", "distance").click()
     click_point(page, first)
     click_point(page, second)
@@ -193,8 +193,8 @@ def test_angle_of_three_clicks_at_a_corner_of_the_box_is_a_right_one(page):
 
 def test_button_clear_removes_all_measures(page):
     page.find_element("id", "distance").click()
-    click_point(page, sphere_point(-0.6, -0.3))
-    click_point(page, sphere_point(0.5, 0.55))
+    click_point(page, sphere_point(left=-0.6, up=-0.3))
+    click_point(page, sphere_point(left=0.5, up=0.55))
     assert len(listed_measures(page)) == 1
     page.find_element("id", "clear").click()
     assert listed_measures(page) == []
@@ -266,7 +266,8 @@ def test_flipped_clip_plane_takes_the_left_half_of_the_view_away(page):
 
 def pixels_of_10_mm_to_the_left(page) -> float:
     """How far to the right 10 mm towards the patient's left are drawn."""
-    return (project(page, CENTRE + (10, 0, 0)) - project(page, CENTRE))[0]
+    x, _ = project(page, CENTRE + (10, 0, 0)) - project(page, CENTRE)
+    return x
 
 
 def test_wheel_zooms_the_view(page):

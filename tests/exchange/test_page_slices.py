@@ -46,7 +46,7 @@ def test_scan_that_is_too_large_is_averaged_until_it_fits_its_thin_axes_first() 
     volume = make_noise((10, 40, 40), np.diag([0.5, 0.5, 2.0, 1.0]))
     most = 8000  # bytes; 16,000 voxels of noise take some 26,000
 
-    packed = pack_slices(volume, WINDOWS, most)
+    packed = pack_slices(volume, WINDOWS, most_bytes=most)
 
     ci, cj, ck = packed.facts["averaged"]
     assert 4 * len(packed.data) / 3 <= most  # base64 writes 4 letters for 3 bytes
@@ -60,7 +60,7 @@ def test_scan_that_is_too_large_is_averaged_until_it_fits_its_thin_axes_first() 
 def test_averaged_voxel_lies_in_the_middle_of_those_it_was_made_of() -> None:
     volume = make_noise((10, 40, 40), scenes.AFFINE)
 
-    packed = pack_slices(volume, WINDOWS, 8000)
+    packed = pack_slices(volume, WINDOWS, most_bytes=8000)
 
     counts = np.array(packed.facts["averaged"])
     first, last = volume.ijk_to_lps(counts * 2), volume.ijk_to_lps(counts * 3 - 1)
@@ -79,14 +79,16 @@ def test_scan_with_uneven_slices_is_refused() -> None:
 @pytest.mark.unit
 def test_page_holds_the_slices_that_its_mesh_has_and_says_so(tmp_path) -> None:
     packed = pack_slices(scenes.make_scan(), WINDOWS)
-    Mesh(*ball(5.0, 12), report={"page_slices": packed}).save(tmp_path / "page.html")
+    Mesh(*ball(radius=5.0, rings=12), report={"page_slices": packed}).save(tmp_path / "page.html")
 
     page = (tmp_path / "page.html").read_bytes()
 
     held = parse_slices(page)
     assert held is not None
     assert (held.facts, held.data) == (packed.facts, packed.data)
-    assert parse_page(page)[0]["about"][0].startswith("Slices: 44 x 40 x 22 values")
+    facts, _ = parse_page(page)
+    nk, nj, ni = scenes.SHAPE
+    assert facts["about"][0].startswith(f"Slices: {ni} x {nj} x {nk} values")
     assert len(page) < MOST_BYTES
 
 
@@ -96,7 +98,8 @@ def test_slices_of_a_page_say_the_hu_of_the_place_that_was_clicked_on_its_surfac
     from browser import open_page, severe_lines
     from selenium.webdriver import ActionChains
 
-    vertices, triangles = ball(4.0, 24)
+    radius_mm = 4.0
+    vertices, triangles = ball(radius_mm, rings=24)
     mesh = Mesh(
         vertices + scenes.middle(0), triangles, report={"page_slices": pack_slices(scenes.make_scan(), WINDOWS)}
     )
@@ -111,5 +114,5 @@ def test_slices_of_a_page_say_the_hu_of_the_place_that_was_clicked_on_its_surfac
     said_mm = [float(value) for value in words.split("(")[1].split(")")[0].split(",")]
     assert "1000 HU" in words
     voxel_mm = 1.4  # the longest side: places on a slice are those of voxels
-    assert said_mm == pytest.approx((scenes.middle(0) + (0.0, -4.0, 0.0)).tolist(), abs=voxel_mm)
+    assert said_mm == pytest.approx((scenes.middle(0) - (0.0, radius_mm, 0.0)).tolist(), abs=voxel_mm)
     assert severe_lines(view_browser) == []
