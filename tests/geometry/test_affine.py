@@ -31,7 +31,7 @@ COLUMN = np.array([-0.36, 0.48, 0.8])
 @pytest.fixture
 def composed():
     """Columns 0.5 mm apart along a row, rows 0.7 mm apart along a column, slices by (0, 0.3, 2.5) mm."""
-    return compose_affine(ROW * 0.5, COLUMN * 0.7, (0.0, 0.3, 2.5), (-10.0, 20.0, 30.0))
+    return compose_affine(ROW * 0.5, COLUMN * 0.7, k_step=(0.0, 0.3, 2.5), origin=(-10.0, 20.0, 30.0))
 
 
 def test_a_composed_affine_places_the_origin_columns_rows_and_slices(composed):
@@ -54,13 +54,14 @@ def test_tilt_is_positive_where_the_front_edge_is_nearer_the_head(tilt, prone, t
     turned = -1.0 if prone else 1.0
     row = np.array([turned, 0.0, 0.0])
     back = np.array([0.0, np.cos(angle), -np.sin(angle)])  # the back edge of a slice lies lower
-    affine = compose_affine(row, turned * back, (0.0, 0.0, towards * 2.0), (0.0, 0.0, 0.0))
+    affine = compose_affine(row, turned * back, k_step=(0.0, 0.0, towards * 2.0), origin=(0.0, 0.0, 0.0))
     assert signed_tilt(affine) == pytest.approx(tilt, abs=1e-9)
 
 
 @pytest.mark.parametrize("lean", [0.5, -0.5])
 def test_the_tilt_of_coronal_slices_has_no_sign(lean):
-    affine = compose_affine((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 2.0, lean), (0.0, 0.0, 0.0))
+    row, column = (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)
+    affine = compose_affine(row, column, k_step=(0.0, 2.0, lean), origin=(0.0, 0.0, 0.0))
     assert signed_tilt(affine) == pytest.approx(np.degrees(np.arctan2(0.5, 2.0)))
 
 
@@ -70,7 +71,8 @@ TILTS = pytest.mark.parametrize("tilt", [0.0, 1.0, 12.0, -20.0])
 def tilted_affine(tilt: float) -> np.ndarray:
     """Slices turned about x by so many degrees, stacked along z."""
     angle = np.radians(tilt)
-    return compose_affine((0.5, 0, 0), (0, 0.7 * np.cos(angle), 0.7 * np.sin(angle)), (0, 0, 1.25), (1, 2, 3))
+    column = np.array([0, np.cos(angle), np.sin(angle)])
+    return compose_affine((0.5, 0, 0), 0.7 * column, k_step=(0, 0, 1.25), origin=(1, 2, 3))
 
 
 @TILTS
@@ -85,13 +87,13 @@ def test_the_normal_of_tilted_slices_is_turned_by_the_tilt(tilt):
 
 
 def test_an_affine_is_left_handed_once_one_axis_is_turned_round():
-    right_handed = compose_affine(ROW, COLUMN, np.cross(ROW, COLUMN), (0, 0, 0))
+    right_handed = compose_affine(ROW, COLUMN, k_step=np.cross(ROW, COLUMN), origin=(0, 0, 0))
     assert not is_left_handed(right_handed)
     assert is_left_handed(right_handed @ np.diag((1.0, 1.0, -1.0, 1.0)))
 
 
 def test_normal_matrix_keeps_normals_perpendicular_under_shear():
-    sheared = compose_affine((0.7, 0, 0), (0, 0.5, 0.1), (0.2, -0.4, 2.5), (0, 0, 0))
+    sheared = compose_affine((0.7, 0, 0), (0, 0.5, 0.1), k_step=(0.2, -0.4, 2.5), origin=(0, 0, 0))
     tangents_ijk = np.array([(1.0, 2.0, 0.0), (0.0, 1.0, -3.0)])
     tangents_mm = tangents_ijk @ sheared[:3, :3].T
     normal = normal_matrix(sheared) @ np.cross(*tangents_ijk)

@@ -47,25 +47,25 @@ def between(z0, z1):
 
 
 def test_voxels_whose_centres_lie_on_the_sides_of_the_box_stay_in_their_place():
-    cropped = crop_volume(numbered_volume(), (2, 3, 8), (4, 9, 16))
+    cropped = crop_volume(numbered_volume(), low=(2, 3, 8), high=(4, 9, 16))
     assert cropped.shape_ijk == (2, 3, 3)
     assert np.array_equal(cropped.affine[:3, 3], (2, 3, 8))
     check_places(numbered_volume(), cropped)
 
 
 def test_report_of_a_crop_has_the_indices_of_its_first_voxel():
-    cropped = crop_volume(numbered_volume(), (2, 3, 8), (4, 9, 16))
+    cropped = crop_volume(numbered_volume(), low=(2, 3, 8), high=(4, 9, 16))
     assert cropped.report["crop"]["first_ijk"] == [1, 1, 2]
 
 
 def test_a_box_in_ras_keeps_the_voxels_of_the_box_in_lps_with_x_and_y_negated():
-    in_ras = crop_volume(numbered_volume(), (-4, -9, 8), (-2, -3, 16), space="ras")
-    in_lps = crop_volume(numbered_volume(), (2, 3, 8), (4, 9, 16))
+    in_ras = crop_volume(numbered_volume(), low=(-4, -9, 8), high=(-2, -3, 16), space="ras")
+    in_lps = crop_volume(numbered_volume(), low=(2, 3, 8), high=(4, 9, 16))
     assert np.array_equal(in_ras.voxels, in_lps.voxels)
 
 
 def test_the_warning_of_a_crop_in_ras_has_the_coordinates_and_the_frame_that_were_given():
-    warning = crop_volume(numbered_volume(), (-4, -9, 8), (-2, -3, 16), space="ras").report["warnings"][-1]
+    warning = crop_volume(numbered_volume(), low=(-4, -9, 8), high=(-2, -3, 16), space="ras").report["warnings"][-1]
     assert "x -4 to -2" in warning
     assert "(RAS)" in warning
 
@@ -110,7 +110,7 @@ def test_the_certificate_of_a_crop_has_its_shape_affine_and_range(oblique_crop):
 @pytest.mark.parametrize("sign", [1.0, -1.0], ids=["upwards", "downwards"])
 def test_uneven_slices_of_a_crop_stay_in_their_place(sign):
     voxels = np.arange(6 * 5 * 4, dtype=np.int32).reshape(6, 5, 4)
-    volume = uneven(voxels, sign)
+    volume = uneven(voxels, sign=sign)
     heights = positions(sign)[:, 2]
     low, high = sorted((heights[1], heights[4]))
     cropped = crop_volume(volume, *between(low - 1, high + 1))
@@ -143,7 +143,7 @@ def test_slices_of_a_crop_across_a_gap_are_uneven(stack_with_a_gap):
 
 def test_a_crop_of_an_uneven_stack_to_one_voxel_is_even_and_in_its_place():
     volume = uneven(np.arange(6 * 5 * 4, dtype=np.int32).reshape(6, 5, 4))
-    first_voxel_of_slice_4 = positions()[4]
+    first_voxel_of_slice_4 = volume.slice_origins()[4]
     cropped = crop_volume(volume, first_voxel_of_slice_4 - 1e-3, first_voxel_of_slice_4 + 1e-3)
     assert cropped.voxels.shape == (1, 1, 1)
     assert not cropped.uneven
@@ -157,7 +157,7 @@ def test_a_box_above_the_volume_is_refused_with_its_heights_and_frame():
 
 def test_a_box_whose_low_corner_lies_above_the_high_one_is_refused():
     with refused(UsageError, 9, 3):
-        crop_volume(numbered_volume(), (0, 9, 0), (1, 3, 1))
+        crop_volume(numbered_volume(), low=(0, 9, 0), high=(1, 3, 1))
 
 
 @pytest.mark.parametrize(

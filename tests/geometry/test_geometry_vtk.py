@@ -262,7 +262,7 @@ def test_contours_of_a_resampled_sphere_lie_on_it_but_for_its_sagitta(name):
     image = volume.to_pyvista(resample=True)
     contour = image.contour([200.0], method="flying_edges", compute_normals=True)
     radii = np.linalg.norm(contour.points - off_centre(volume), axis=1)
-    assert len(radii) > 300
+    assert len(radii) > 300  # points of the contour; measured 438 to 608
     gaps = np.linalg.norm(np.diff(volume.slice_origins(), axis=0), axis=1)
     too_long = sum(np.square([*volume.spacing[:2], gaps.max()])) + sum(np.square(image.spacing))
     assert radii.max() <= RADIUS + tolerances.IMAGE_SURFACE_MM

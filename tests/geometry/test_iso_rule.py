@@ -12,7 +12,7 @@ from clrecon.geometry import AIR_HU, Volume
 from clrecon.geometry.iso_rule import ValueRange, choose_iso_rule, layer_margins, vertex_margin
 
 
-def make_volume(low: float, high: float, dtype: str = "int16") -> Volume:
+def make_volume(*, low: float, high: float, dtype: str = "int16") -> Volume:
     """Voxels of 0.7 x 0.5 x 2.5 mm of a low value, one of them of a high one."""
     voxels = np.full((3, 4, 5), low, dtype)
     voxels[1, 2, 3] = high
@@ -20,28 +20,28 @@ def make_volume(low: float, high: float, dtype: str = "int16") -> Volume:
 
 
 def test_an_integer_level_of_integers_lies_half_a_unit_below_it():
-    rule = choose_iso_rule(make_volume(-1000, 900), 200)
+    rule = choose_iso_rule(make_volume(low=-1000, high=900), 200)
     assert (rule.lowest_inside, rule.iso_level) == (200, 199.5)
 
 
 def test_a_fractional_level_of_integers_is_kept_and_the_next_integer_is_inside():
-    rule = choose_iso_rule(make_volume(-1000, 900), 200.25)
+    rule = choose_iso_rule(make_volume(low=-1000, high=900), 200.25)
     assert (rule.lowest_inside, rule.iso_level) == (201, 200.25)
 
 
 def test_floats_are_inside_from_the_level_on():
-    rule = choose_iso_rule(make_volume(-1.0, 1.0, "float32"), 0.25)
+    rule = choose_iso_rule(make_volume(low=-1.0, high=1.0, dtype="float32"), 0.25)
     assert (rule.lowest_inside, rule.iso_level) == (0.25, 0.25)
 
 
 @pytest.mark.parametrize(("low", "outside"), [(-3024, AIR_HU), (-1000, -1000), (3, 3)])
 def test_the_value_outside_is_the_lowest_of_the_volume_but_not_below_air(low, outside):
-    assert choose_iso_rule(make_volume(low, 900), 200).outside == outside
+    assert choose_iso_rule(make_volume(low=low, high=900), 200).outside == outside
 
 
 @pytest.mark.parametrize(("low", "iso_value"), [(300, 200), (-1024, -1500), (200, 200)])
 def test_the_value_outside_lies_below_the_level_where_all_voxels_are_inside(low, iso_value):
-    rule = choose_iso_rule(make_volume(low, 900), iso_value)
+    rule = choose_iso_rule(make_volume(low=low, high=900), iso_value)
     assert rule.outside < rule.iso_level
 
 
@@ -86,7 +86,7 @@ def test_the_value_outside_lies_half_a_unit_or_2_to_the_minus_20_of_the_level_be
 def test_the_value_outside_of_a_surface_below_a_level_is_as_far_above_as_the_lowest_is_below(
     dtype, low, level, outside
 ):
-    assert choose_iso_rule(make_volume(low, 900, dtype), level, below=True).outside == outside
+    assert choose_iso_rule(make_volume(low=low, high=900, dtype=dtype), level, below=True).outside == outside
 
 
 @pytest.mark.parametrize(
@@ -94,7 +94,7 @@ def test_the_value_outside_of_a_surface_below_a_level_is_as_far_above_as_the_low
     [(-(2**29), False, -(2**29) - 1), (-(2**31), False, -(2**30)), (2**29, True, 2**29), (2**31, True, 2**30)],
 )
 def test_the_value_outside_fits_32_bits_with_every_integer(level, below, outside):
-    assert choose_iso_rule(make_volume(-1000, 900), level, below=below).outside == outside
+    assert choose_iso_rule(make_volume(low=-1000, high=900), level, below=below).outside == outside
 
 
 @pytest.mark.parametrize(("figure", "slices"), [("ends", 3), ("lowest", 2)])
@@ -114,7 +114,7 @@ def test_floats_are_scaled_below_one_by_a_power_of_two_that_float32_holds(value,
 
 
 def test_integers_are_not_scaled():
-    assert choose_iso_rule(make_volume(0, 900), 200).value_scale == 1.0
+    assert choose_iso_rule(make_volume(low=0, high=900), 200).value_scale == 1.0
 
 
 @pytest.mark.parametrize(
@@ -131,26 +131,26 @@ def test_integers_are_not_scaled():
 )
 def test_values_and_levels_between_which_float32_cannot_interpolate_are_refused(low, high, dtype, iso_value):
     with pytest.raises(UsageError, match="supported|interpolated"):
-        choose_iso_rule(make_volume(low, high, dtype), iso_value)
+        choose_iso_rule(make_volume(low=low, high=high, dtype=dtype), iso_value)
 
 
 @pytest.mark.parametrize("bad", ["abc", None, {}])
 def test_an_iso_value_that_is_no_number_is_refused(bad):
     with refused(UsageError, "number"):
-        choose_iso_rule(make_volume(0, 1), bad)
+        choose_iso_rule(make_volume(low=0, high=1), bad)
 
 
 def test_a_volume_whose_steps_float32_cannot_hold_beside_its_size_is_refused():
     affine = np.diag((1e4, 1e4, 1e-3, 1.0))  # columns 10 m apart, slices a micrometre
     from_the_centre_mm = 3 * 1e4  # two of five columns, and the layer around
     with refused(UsageError, "float32", from_the_centre_mm):
-        vertex_margin(Volume(np.zeros((3, 4, 5), np.int16), affine), 1)
+        vertex_margin(Volume(np.zeros((3, 4, 5), np.int16), affine), border=1)
 
 
 def margin_at(x_mm: float) -> np.ndarray:
     """The margin of vertices, in voxels of 0.1 mm, of a volume so far from the origin."""
     affine = np.diag((0.1, 0.1, 0.1, 1.0)) + np.eye(4, k=3) * x_mm
-    return vertex_margin(Volume(np.zeros((3, 4, 5), np.int16), affine), 1)
+    return vertex_margin(Volume(np.zeros((3, 4, 5), np.int16), affine), border=1)
 
 
 def test_the_margin_near_the_origin_is_four_steps_of_float32():
@@ -165,20 +165,20 @@ def test_the_margin_far_from_the_origin_is_that_of_coordinates_from_the_centre()
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_an_iso_value_that_is_not_finite_is_refused(bad):
     with refused(UsageError, "finite"):
-        choose_iso_rule(make_volume(0, 1), bad)
+        choose_iso_rule(make_volume(low=0, high=1), bad)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_voxels_that_are_not_finite_are_refused(bad):
     with pytest.raises(NoSurfaceError, match="NaN|infinite"):
-        choose_iso_rule(make_volume(0.0, bad, "float32"), 0.5)
+        choose_iso_rule(make_volume(low=0.0, high=bad, dtype="float32"), 0.5)
 
 
 def test_the_margin_is_four_steps_of_float32_in_voxels_of_each_axis():
     affine = np.diag((0.5, 0.25, 2.0, 1.0))
     affine[0, 3] = -800.0
     step_at_800_mm = 2.0**-14
-    margin = vertex_margin(Volume(np.zeros((3, 4, 5), np.int16), affine), 1)
+    margin = vertex_margin(Volume(np.zeros((3, 4, 5), np.int16), affine), border=1)
     assert margin == pytest.approx(4 * step_at_800_mm / np.array((0.5, 0.25, 2.0)))
 
 
@@ -189,7 +189,7 @@ def test_the_margin_is_four_steps_of_float32_in_voxels_of_each_axis():
 def test_the_ends_of_a_range_of_integers_lie_half_a_unit_beyond_and_those_of_floats_at_the_values(
     dtype, lowest, level, highest, upper
 ):
-    rule = choose_iso_rule(make_volume(-1000, 900, dtype), [200, 300])
+    rule = choose_iso_rule(make_volume(low=-1000, high=900, dtype=dtype), [200, 300])
     assert (rule.inside, rule.iso_value, rule.upper_value) == ("between", 200, 300)
     assert (rule.lowest_inside, rule.iso_level) == (lowest, level)
     assert (rule.highest_inside, rule.upper_level) == (highest, upper)
@@ -197,7 +197,9 @@ def test_the_ends_of_a_range_of_integers_lie_half_a_unit_beyond_and_those_of_flo
 
 @pytest.mark.parametrize("level", [200, 200.0, np.int16(200), np.float32(200.0), np.array(200)])
 def test_a_number_of_any_kind_is_one_level(level):
-    assert choose_iso_rule(make_volume(-1000, 900), level) == choose_iso_rule(make_volume(-1000, 900), 200)
+    assert choose_iso_rule(make_volume(low=-1000, high=900), level) == choose_iso_rule(
+        make_volume(low=-1000, high=900), 200
+    )
 
 
 @pytest.mark.parametrize(
@@ -212,7 +214,7 @@ def test_a_number_of_any_kind_is_one_level(level):
 )
 def test_levels_that_are_no_range_of_two_are_refused(level, below, words):
     with refused(UsageError, *words):
-        choose_iso_rule(make_volume(-1000, 900), level, below=below)
+        choose_iso_rule(make_volume(low=-1000, high=900), level, below=below)
 
 
 @pytest.mark.parametrize("border", [0, 1])
@@ -232,5 +234,5 @@ def test_each_layer_has_a_margin_of_four_steps_of_float32(border):
     ],
 )
 def test_values_at_the_ends_are_inside_above_and_between_and_outside_below(level, below, inside):
-    rule = choose_iso_rule(make_volume(-1000, 900), level, below=below)
+    rule = choose_iso_rule(make_volume(low=-1000, high=900), level, below=below)
     assert rule.mark_inside(np.array([199, 200, 250, 300, 301])).tolist() == inside

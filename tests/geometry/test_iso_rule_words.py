@@ -41,11 +41,12 @@ def test_the_report_of_a_rule_has_its_level_and_both_ends_of_what_is_inside(leve
 
 
 def test_a_rule_made_by_hand_has_one_level_above_which_is_inside_and_scales_nothing():
-    rule = IsoRule(0.5, 1, 0.5, 0.0, True)
+    rule = IsoRule(iso_value=0.5, lowest_inside=1, iso_level=0.5, outside=0.0, closed=True)
     assert rule.levels == (0.5,)
     assert (rule.value_scale, rule.topology, rule.inside) == (1.0, "separated", "above")
 
 
 @pytest.mark.parametrize(("closed", "border"), [(True, 1), (False, 0)])
 def test_a_rule_that_closes_the_surface_has_a_layer_around_the_volume(closed, border):
-    assert IsoRule(0.5, 1, 0.5, 0.0, closed).border == border
+    rule = IsoRule(iso_value=0.5, lowest_inside=1, iso_level=0.5, outside=0.0, closed=closed)
+    assert rule.border == border

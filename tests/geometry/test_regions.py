@@ -18,6 +18,8 @@ from clrecon.geometry.regions import (
 )
 
 FREE = ((False, False),) * 3
+"""Of none of the six ends of a scan: the body ends there."""
+ONE_MM = (1.0, 1.0, 1.0)
 
 
 def ball(radius: float, steps: tuple[float, float, float]) -> np.ndarray:
@@ -72,10 +74,10 @@ LOW_END_CUT, HIGH_END_CUT = ((True, False), *FREE[1:]), ((False, True), *FREE[1:
 BOTH_ENDS_CUT, ALL_ENDS_CUT = ((True, True), *FREE[1:]), ((True, True),) * 3
 
 WIDTHS_AT_ENDS = {
-    "half a ball is half as wide": (ball(20.0, (1.0,) * 3)[20:], FREE, 10.0),
-    "half a ball goes on beyond the end": (ball(20.0, (1.0,) * 3)[20:], LOW_END_CUT, 20.0),
+    "half a ball is half as wide": (ball(20.0, ONE_MM)[20:], FREE, 10.0),
+    "half a ball goes on beyond the end": (ball(20.0, ONE_MM)[20:], LOW_END_CUT, 20.0),
     "a cap has the radius of its disc at the end": (
-        ball(20.0, (1.0,) * 3)[:10], HIGH_END_CUT, np.sqrt(20.0**2 - 10.0**2),
+        ball(20.0, ONE_MM)[:10], HIGH_END_CUT, np.sqrt(20.0**2 - 10.0**2),
     ),
     "a slab goes on beyond both ends": (np.ones((3, 30, 30), bool), BOTH_ENDS_CUT, 15.0),
 }  # fmt: skip
@@ -83,11 +85,11 @@ WIDTHS_AT_ENDS = {
 
 @pytest.mark.parametrize(("mask", "ends", "width"), WIDTHS_AT_ENDS.values(), ids=WIDTHS_AT_ENDS)
 def test_a_body_goes_on_beyond_ends_that_the_scan_cuts_and_a_disc_there_counts(mask, ends, width):
-    assert measure_width(mask, ends, (1.0,) * 3) == pytest.approx(width, abs=WITHIN_TWO_VOXELS)
+    assert measure_width(mask, ends, ONE_MM) == pytest.approx(width, abs=WITHIN_TWO_VOXELS)
 
 
 def test_a_body_that_the_scan_cuts_at_every_end_is_infinitely_wide():
-    assert measure_width(np.ones((3, 30, 30), bool), ALL_ENDS_CUT, (1.0,) * 3) == np.inf
+    assert measure_width(np.ones((3, 30, 30), bool), ALL_ENDS_CUT, ONE_MM) == np.inf
 
 
 def test_background_of_an_end_is_open_outside_of_rings_and_not_within():

@@ -12,7 +12,8 @@ def test_resampled_planes_hold_the_end_values_half_a_step_beyond_the_last_centre
     """Slices of 5 and 9 at k = 0 and 1; planes at k = -0.75, -0.5 (still in the voxel), -0.25 and so on to 1.75."""
     voxels = np.array([[[5]], [[9]]], np.int16)
     quarter_steps = np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0.25, -0.75], [0, 0, 0, 1.0]])
-    planes = resample_grid(Volume(voxels, np.eye(4)), RegularGrid(quarter_steps, (1, 1, 11)), -1000.0)
+    grid = RegularGrid(quarter_steps, shape_ijk=(1, 1, 11))
+    planes = resample_grid(Volume(voxels, np.eye(4)), grid, air=-1000.0)
     assert planes.ravel().tolist() == [-1000, 5, 5, 5, 6, 7, 8, 9, 9, 9, -1000]
 
 

@@ -16,9 +16,11 @@ from clrecon.errors import UsageError
 TILTED = np.array([[0.7, 0.02, 0.01, 1.0], [0.0, 0.7, 0.3, 2.0], [0.1, 0.0, 1.1, 3.0], [0.0, 0.0, 0.0, 1.0]])
 MIRRORED = TILTED @ np.diag([-1.0, 1.0, 1.0, 1.0])
 
+HIGHEST_HU = 1500
+
 
 def random_volume(affine=TILTED, dtype=np.int16, shape=(12, 15, 18), uneven=False):
-    voxels = np.random.default_rng(1).integers(-1000, 1500, shape).astype(dtype)
+    voxels = np.random.default_rng(1).integers(-1000, HIGHEST_HU, shape).astype(dtype)
     if not uneven:
         return clrecon.Volume(voxels, affine)
     gaps = np.random.default_rng(2).uniform(0.6, 1.9, shape[0] - 1)
@@ -52,7 +54,7 @@ def test_linear_samples_are_sums_over_the_corners_of_their_cell(name):
     volume = VOLUMES[name]
     ijk = np.random.default_rng(3).uniform(0.0, np.array(volume.shape_ijk) - 1.001, (100, 3))
     expected = [interpolate_by_corners(volume, place) for place in ijk]
-    assert volume.sample(volume.ijk_to_lps(ijk)) == pytest.approx(expected, abs=tolerances.TRILINEAR * 1500)
+    assert volume.sample(volume.ijk_to_lps(ijk)) == pytest.approx(expected, abs=tolerances.TRILINEAR * HIGHEST_HU)
 
 
 def voxel_centres(volume) -> np.ndarray:
@@ -66,7 +68,7 @@ def voxel_centres(volume) -> np.ndarray:
 def test_samples_at_voxel_centres_are_the_voxels(name, order):
     volume = VOLUMES[name]
     values = volume.sample(voxel_centres(volume), order=order)
-    assert values == pytest.approx(volume.voxels.ravel(), abs=tolerances.TRILINEAR * 1500)
+    assert values == pytest.approx(volume.voxels.ravel(), abs=tolerances.TRILINEAR * HIGHEST_HU)
 
 
 def test_a_point_takes_the_nearest_voxel():

@@ -10,7 +10,7 @@ import pytest
 import tolerances
 from dicom_series import rotation
 from refusals import assert_one_line, refused
-from uneven_volume import positions, uneven
+from uneven_volume import uneven
 
 from clrecon import LabelMap, Volume, resample_labels
 from clrecon.errors import UsageError
@@ -43,7 +43,7 @@ VOLUMES = {
     "flipped": numbered_volume(affine_of_steps(np.diag((-0.7, -0.5, 1.25)))),
     "sheared": numbered_volume(affine_of_steps(STEPS @ SHEAR)),
     "uneven": uneven(np.arange(np.prod(SHAPE), dtype=np.int32).reshape(SHAPE)),
-    "uneven, left-handed": uneven(np.arange(np.prod(SHAPE), dtype=np.int32).reshape(SHAPE), -1.0),
+    "uneven, left-handed": uneven(np.arange(np.prod(SHAPE), dtype=np.int32).reshape(SHAPE), sign=-1.0),
 }
 EVEN_WITHIN_MM = 0.0125
 """Uneven slices of which those left are even within the tolerance of reading get an affine."""
@@ -163,9 +163,10 @@ def test_a_single_voxel_keeps_value_place_spacing_and_the_direction_of_its_range
 
 
 def test_one_slice_of_an_uneven_volume_is_even_and_lies_where_it_did():
-    slab = VOLUMES["uneven"][4:5]
+    volume = VOLUMES["uneven"]
+    slab = volume[4:5]
     assert not slab.uneven
-    assert np.allclose(slab.affine[:3, 3], positions()[4])
+    assert np.allclose(slab.affine[:3, 3], volume.slice_origins()[4])
 
 
 @pytest.fixture

@@ -60,14 +60,14 @@ SLOPE_A_MM = np.array([3.0, -2.0, 5.0])
 def test_gradients_of_a_linear_field_from_central_differences_are_exact_in_each_slice(k):
     before, _, after = uneven().slice_origins(border=1)[k : k + 3] @ SLOPE_A_MM
     differences = (*(IN_PLANE.T @ SLOPE_A_MM), (after - before) / 2)
-    assert slice_normal_matrices(uneven(), 0)[k] @ differences == pytest.approx(SLOPE_A_MM)
+    assert slice_normal_matrices(uneven(), border=0)[k] @ differences == pytest.approx(SLOPE_A_MM)
 
 
 @pytest.mark.parametrize("k", range(6))
 def test_gradients_of_a_linear_field_from_one_slice_to_the_next_are_exact_in_each_layer(k):
     here, after = uneven().slice_origins(border=1)[k + 1 : k + 3] @ SLOPE_A_MM
     differences = (*(IN_PLANE.T @ SLOPE_A_MM), after - here)
-    assert layer_normal_matrices(uneven(), 0)[k] @ differences == pytest.approx(SLOPE_A_MM)
+    assert layer_normal_matrices(uneven(), border=0)[k] @ differences == pytest.approx(SLOPE_A_MM)
 
 
 @pytest.fixture
@@ -88,7 +88,8 @@ def test_even_slices_by_their_positions_lie_where_their_affine_puts_them(affine_
 
 def test_even_slices_by_their_positions_have_the_gradients_of_their_affine(affine_and_positions):
     by_affine, by_positions = affine_and_positions
-    assert slice_normal_matrices(by_positions, 1) == pytest.approx(slice_normal_matrices(by_affine, 1))
+    expected = slice_normal_matrices(by_affine, border=1)
+    assert slice_normal_matrices(by_positions, border=1) == pytest.approx(expected)
 
 
 def test_a_volume_with_a_table_of_positions_counts_as_uneven(affine_and_positions):
@@ -144,7 +145,7 @@ def test_repr_of_an_even_volume_has_its_size_type_and_spacing():
 
 @pytest.mark.filterwarnings("error")
 def test_a_point_that_is_not_finite_has_no_finite_indices_and_changes_no_other():
-    volume = Volume(np.zeros((4, 5, 6), np.int16), np.eye(4), None, [(0, 0, z) for z in (0.0, 1.0, 2.5, 3.0)])
+    volume = Volume(np.zeros((4, 5, 6), np.int16), np.eye(4), slice_positions=[(0, 0, z) for z in (0.0, 1.0, 2.5, 3.0)])
     nan, infinite, finite = volume.lps_to_ijk([[np.nan, 0, 0], [0, 0, np.inf], [1, 2, 2.5]])
     assert not np.isfinite(nan).all()
     assert not np.isfinite(infinite).all()

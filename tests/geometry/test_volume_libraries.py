@@ -37,7 +37,7 @@ AFFINES = {
     "left-handed": affine_of_steps(STEPS * (1, 1, -1)),
     "left-handed, i": affine_of_steps(STEPS * (-1, 1, 1)),
     "flipped": affine_of_steps(np.diag((-0.7, -0.5, 1.25))),
-    "sagittal": compose_affine((0, 0.7, 0), (0, 0, -0.5), (-1.25, 0, 0), ORIGIN),
+    "sagittal": compose_affine(i_step=(0, 0.7, 0), j_step=(0, 0, -0.5), k_step=(-1.25, 0, 0), origin=ORIGIN),
 }
 SHEARED = affine_of_steps(STEPS @ np.array([[1, 0, 0], [0, 1, 0.3], [0, 0, 1]]))
 DTYPES = ("int8", "uint8", "int16", "uint16", "int32", "float32")
@@ -311,9 +311,9 @@ def test_a_ramp_in_uneven_slices_is_the_ramp_once_resampled(library, uneven_ramp
 
 
 def test_resampling_slices_too_near_for_a_grid_is_refused_with_their_number():
-    table = np.array([(0, 0, 0), (0, 0, 1e-4), (0, 0, 100.0)])
+    table = np.array([(0, 0, 0), (0, 0, 1e-4), (0, 0, 100.0)])  # over 100 mm, in steps of 1e-4 mm
     volume = Volume(np.zeros((3, 50, 50), np.int16), np.diag((1.0, 1.0, 50.0, 1.0)), slice_positions=table)
-    with refused(RefusedInputError, 50, 1000001):
+    with refused(RefusedInputError, 50, 100 / 1e-4 + 1):
         volume.to_pyvista(resample=True)
 
 
