@@ -316,7 +316,7 @@ def test_a_mapped_volume_is_looked_at_slice_by_slice_in_little_memory(tmp_path) 
 
     tracemalloc.start()
     chosen = choose_iso_value(volume)
-    peak = tracemalloc.get_traced_memory()[1]
+    _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
 
     assert (chosen.slices, chosen.slice_step) == (200, 4)

@@ -93,7 +93,7 @@ def test_star_import_takes_the_public_names() -> None:
 
 def test_no_public_function_takes_device_memory_or_progress_by_position() -> None:
     functions = dict(public_callables())
-    assert len(functions) > 60  # with methods; measured 305, and of none nothing would be looked at
+    assert len(functions) > 200  # with methods; measured 305, and of none nothing would be looked at
     assert {name: found for name, function in functions.items() if (found := by_position(function))} == {}
 
 

@@ -54,7 +54,7 @@ def find_tests_without_assertion(source: str) -> list[str]:
 
 def test_every_test_asserts_a_value() -> None:
     files = [path for path in project_files(".py") if path.name.startswith("test_") and "tests" in path.parts]
-    assert len(files) >= 5  # of some 490: tests are looked for where they lie
+    assert len(files) > 300  # of some 490: tests are looked for where they lie
     lazy = {path.name: names for path in files if (names := find_tests_without_assertion(path.read_text()))}
     assert lazy == {}
 
@@ -108,7 +108,7 @@ def test_test_that_asserts_a_value_or_expects_a_message_is_accepted(body: str) -
 
 def test_no_file_has_a_path_of_one_machine_or_an_unfinished_mark() -> None:
     files = project_files(*TEXT_SUFFIXES)
-    assert len(files) > 40  # of more than 1000: texts are looked for where they lie
+    assert len(files) > 600  # of more than 1000: texts are looked for where they lie
     faults = [f"{path.name}:{fault}" for path in files for fault in find_forbidden(path.read_text(encoding="utf-8"))]
     assert faults == []
 

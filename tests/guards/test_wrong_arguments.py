@@ -58,7 +58,7 @@ def things() -> dict[str, Any]:
         "PointCloud": clrecon.extract_points(volume, hu=(200, 3000)),
         "Mask": clrecon.Mask.from_band(volume, (200, 3000)),
         "Camera": clrecon.Camera.fit(volume),
-        "Clip": clrecon.Clip.box((0, 0, 0), (5, 5, 5)),
+        "Clip": clrecon.Clip.box(low=(0, 0, 0), high=(5, 5, 5)),
         "Rendering": clrecon.render(volume, size=(16, 16)),
         "TransferFunction": clrecon.TransferFunction.from_window(0, 1000),
         "SurfaceExtractor": clrecon.SurfaceExtractor(volume),

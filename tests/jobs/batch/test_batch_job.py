@@ -40,6 +40,7 @@ def write_cohort(folder: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def cohort(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the manifest m.csv, and out/ with three balls, A, B and C, and the case "gone" without a scan."""
     folder = write_cohort(tmp_path_factory.mktemp("cohort"))
     assert main(["batch", str(folder / "m.csv"), "-o", str(folder / "out"), "--hu", "0", "-q"]) == 8
     return folder
@@ -78,7 +79,7 @@ def test_report_of_a_case_has_the_volume_and_gates_of_its_mesh(cohort: Path) -> 
     mesh = json.loads((cohort / "out" / "C" / "case.json").read_text())["mesh"]
 
     radius_cm = 0.5
-    assert mesh["volume_ml"] == pytest.approx(4 / 3 * np.pi * radius_cm**3, rel=0.05)  # in voxels of 1 mm
+    assert mesh["volume_ml"] == pytest.approx(4 / 3 * np.pi * radius_cm**3, rel=0.05)  # in voxels of 1 mm: measured 3.6 % less
     assert {gate["name"] for gate in mesh["gates"]} >= {"closed", "manifold"}
 
 

@@ -27,14 +27,14 @@ def read_table(folder: Path, text: str) -> list[Case]:
 def test_paths_of_a_table_start_at_its_folder_and_further_columns_may_be_empty(tmp_path: Path) -> None:
     cases = read_table(tmp_path, "\ufeffinput, case ,labels,series\r\nct/a,P-1,,\r\n\r\n/abs/b , p.2,l.nii,7\r\n")
     assert cases == [
-        Case("P-1", str(tmp_path / "ct/a"), None, None),
-        Case("p.2", "/abs/b", "7", str(tmp_path / "l.nii")),
+        Case(name="P-1", source=str(tmp_path / "ct/a"), series=None, labels=None),
+        Case(name="p.2", source="/abs/b", series="7", labels=str(tmp_path / "l.nii")),
     ]
 
 
 def test_table_with_semicolons_as_excel_writes_it_in_many_countries_is_read(tmp_path: Path) -> None:
     cases = read_table(tmp_path, "\ufeffcase;input;series\r\nP-1;/ct/a,b;7\r\n")
-    assert cases == [Case("P-1", "/ct/a,b", "7", None)]
+    assert cases == [Case(name="P-1", source="/ct/a,b", series="7", labels=None)]
 
 
 BAD_TABLES = {
@@ -79,7 +79,7 @@ def test_manifest_of_a_hundred_thousand_rows_is_read_in_less_than_100_mb(tmp_pat
     tracemalloc.start()
     cases = read_table(tmp_path, text)
     check_places(cases, tmp_path / "out")
-    peak = tracemalloc.get_traced_memory()[1]
+    _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert len(cases) == 100_000 and cases[-1].name == "case-99999"
     assert peak < 100e6  # measured 34e6: 340 bytes a row
@@ -127,7 +127,7 @@ def test_folder_without_stacks_is_refused_and_the_columns_of_manifests_are_named
 @pytest.mark.parametrize("output", ["ct/out", "."], ids=["within the input", "around the input"])
 def test_output_within_or_about_an_input_is_refused(output: str, tmp_path: Path) -> None:
     (tmp_path / "ct").mkdir()
-    case = Case("a", str(tmp_path / "ct"), None, None)
+    case = Case(name="a", source=str(tmp_path / "ct"), series=None, labels=None)
     with refused(UsageError, "a"):
         check_places([case], tmp_path / output)
 
