@@ -307,6 +307,7 @@ def downloads(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def view_browser(downloads: Path) -> Iterator[Any]:
+    """A browser of 1200 x 800 pixels that saves into `downloads`."""
     from browser import open_browser
 
     with open_browser(width=1200, height=800) as driver:

@@ -54,7 +54,7 @@ def test_cells_hold_the_mean_and_the_counts_above_300_and_600_hu_of_their_voxels
     assert cells.mean.shape == count_cells(volume)
     for k, j, i in np.ndindex(cells.mean.shape):
         part = voxels[2 * k : 2 * k + 2, 2 * j : 2 * j + 2, 3 * i : 3 * i + 3]
-        assert cells.mean[k, j, i] == pytest.approx(part.mean(dtype=np.float64), abs=1e-3)
+        assert cells.mean[k, j, i] == pytest.approx(part.mean(dtype=np.float64), abs=1e-3)  # sums in float32
         assert (cells.dense[k, j, i], cells.hard[k, j, i]) == ((part > 300).sum(), (part > 600).sum())
 
 

@@ -122,6 +122,7 @@ def test_report_of_a_mesh_warns_of_a_face_at_levels_of_the_skin_of_a_head(
 
 @pytest.fixture(scope="module")
 def head_series(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The DICOM series of the coarse head, with the label map materials.nrrd."""
     folder = tmp_path_factory.mktemp("head") / "ct"
     write_phantom(folder, PhantomSettings(kind="head", **COARSE))
     return folder

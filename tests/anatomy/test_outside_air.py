@@ -55,7 +55,7 @@ def test_report_has_the_millilitres_of_air_that_stay_and_of_those_left_out(patie
     facts = changed.report["outside_air"]
     below = changed.voxels < LEVEL_HU
     left_out = (volume.voxels < LEVEL_HU) & ~below
-    assert facts["kept_ml"] == pytest.approx(below.sum() * VOXEL_ML, abs=1e-3)
+    assert facts["kept_ml"] == pytest.approx(below.sum() * VOXEL_ML, abs=1e-3)  # three decimals are kept
     assert facts["left_out_ml"] == pytest.approx(left_out.sum() * VOXEL_ML, abs=1e-3)
 
 

@@ -24,7 +24,7 @@ SETTINGS = PhantomSettings(size=(160, 144), slices=60, spacing=(1.9, 1.8, 2.5))
 
 @pytest.fixture(scope="module")
 def phantom():
-    """A volume and its canal, 400 points from T9 to L3."""
+    """A volume and its canal, 1,500 points from T9 to L3."""
     voxels, affine, truth = make_phantom(SETTINGS)
     field = tuple(float(n) for n in np.multiply(voxels.shape[::-1], (1.9, 1.8, 2.5)))
     planned = plan_anatomy(field, affine[:3, :3], SETTINGS.seed).vertebrae
@@ -41,7 +41,7 @@ def distances_from_line(points, line) -> np.ndarray:
     curve = Curve(line.points)
     places = curve.at(np.linspace(0.0, curve.length, 2000))
     beside = points[(points[:, 2] <= places[0, 2]) & (points[:, 2] >= places[-1, 2])]
-    assert len(beside) >= 10
+    assert len(beside) >= 10  # of 1,500 points of a phantom's canal, or a slice each of a real scan
     return np.linalg.norm(beside[:, None] - places, axis=2).min(axis=1)
 
 
@@ -53,6 +53,7 @@ def check_lies_in_canal(line, canal) -> None:
 
 @pytest.fixture(scope="module")
 def phantom_line(phantom):
+    """The line that is found in the phantom."""
     return find_spine_line(phantom[0])
 
 
@@ -270,9 +271,9 @@ def line_above_lost_slices(phantom, value):
 def test_the_end_of_a_lost_spine_names_its_height_and_what_was_found_instead(phantom, value, words):
     line, z_mm = line_above_lost_slices(phantom, value)
     assert re.search(words, line.lower.because), line.lower.because
-    assert line.lower.lost_mm == pytest.approx(z_mm, abs=10.0)  # cells are 4 mm high, and means are taken over several
+    assert line.lower.lost_mm == pytest.approx(z_mm, abs=5.0)  # cells are 4 mm high; measured 2.3
     assert line.lower.lost_mm < line.lower.z_mm
-    assert line.points[-1, 2] == pytest.approx(line.lower.z_mm, abs=0.1)
+    assert line.points[-1, 2] == pytest.approx(line.lower.z_mm)
 
 
 def test_the_end_of_a_spine_that_the_scan_cuts_is_not_lost(phantom):

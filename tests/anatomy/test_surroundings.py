@@ -81,7 +81,7 @@ def test_padding_beside_a_body_that_fills_the_slices_is_left_out() -> None:
     assert not out[:, 20:40, 20:40].any()  # the middle of the body
 
 
-def test_nothing_of_a_scan_without_a_body_is_left_out_and_its_report_says_so() -> None:
+def test_nothing_of_a_scan_without_a_body_is_left_out_and_its_report_counts_none() -> None:
     volume = Volume(np.full((8, 40, 40), AIR, np.int16), np.diag([2.0, 2.0, 2.0, 1.0]))
     changed = leave_out_surroundings(volume)
     assert np.array_equal(changed.voxels, volume.voxels)

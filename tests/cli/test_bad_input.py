@@ -26,6 +26,7 @@ def no_device_needed(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def target(tmp_path: Path) -> Path:
+    """The path of a mesh in an empty folder."""
     folder = tmp_path / "out folder"
     folder.mkdir()
     return folder / "bone.stl"

@@ -38,6 +38,7 @@ WITH_A_RESULT = daily(2, ["--version", "info '{scan}'", "info '{scan}' --json", 
 
 @pytest.fixture(scope="module")
 def phantom(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A series of 4 slices of 16 x 16 voxels."""
     folder = tmp_path_factory.mktemp("closed") / "scan"
     assert run_shell(f"phantom '{folder}' --size 16 --slices 4", "").returncode == 0
     return folder

@@ -27,6 +27,7 @@ def complete(script: Path, *words: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def bash_script(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The file of the script for bash."""
     path = tmp_path_factory.mktemp("completion") / "clrecon.bash"
     path.write_text(write_script("bash"))
     return path

@@ -96,6 +96,7 @@ CEILING_WARNING = "900 voxels are at 3071 HU, the ceiling of 12 bits"
 
 @pytest.fixture
 def bright_slice(tmp_path: Path) -> str:
+    """A folder with 4 slices of 30 x 30 voxels, one of which is at the ceiling."""
     bright = set_values(PixelData=np.full((30, 30), 4095, np.uint16).tobytes(), BitsStored=12, HighBit=11)
     write_plan(tmp_path, Plan(shape=(4, 30, 30), signed=False), lambda ds, k: bright(ds, k) if k == 2 else None)
     return str(tmp_path)
@@ -147,6 +148,7 @@ def test_info_lists_series_that_are_not_read_and_describes_the_chosen_one(table_
 
 @pytest.fixture
 def equal_series(tmp_path: Path) -> str:
+    """A folder with the series 1 and 2 of one size."""
     folder = write_series(tmp_path / "ct", number=1)
     return str(write_series(folder, number=2))
 
@@ -272,6 +274,7 @@ WORDS_OF_A_LISTING = ("LUMBAR", "SPINE", "0.9766 x 0.9766 x 4.25", "512 x 512", 
 
 @pytest.fixture
 def long_listing() -> dict[str, Any]:
+    """Two series with the words of `WORDS_OF_A_LISTING`."""
     return make_listing(
         make_entry(1, description="LUMBAR SPINE 0.8 BONE"), make_entry(12, warnings=["gantry tilt " * 9], tilt_deg=12.5)
     )

@@ -28,6 +28,7 @@ SPHERE_ML = 4.0 / 3.0 * np.pi * RADIUS_MM**3 / 1000.0
 
 @pytest.fixture(scope="module")
 def ct(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A series of the sphere of `sphere_voxels`."""
     return write_series(tmp_path_factory.mktemp("ct") / "scan")
 
 
@@ -233,7 +234,7 @@ def test_volume_of_a_split_label_is_judged_once_for_all_its_components(
     options = ("--labels", labels, "--label", 2, "--hu", -150, "--split", "--report", tmp_path / "r.json")
     assert run_mesh(ct, "-o", tmp_path / "b.stl", *options, device=device) == 0
     report = json.loads((tmp_path / "r.json").read_text())
-    assert report["volume_ml"] == pytest.approx(report["meshes"][0]["label_mesh_ml"], rel=1e-6)
+    assert report["volume_ml"] == pytest.approx(report["meshes"][0]["label_mesh_ml"], rel=1e-6)  # sums in another order
     assert [gate["mesh"] for gate in report["gates"] if gate["name"] == "label_volume"] == [None]
 
 
@@ -352,7 +353,7 @@ def test_masks_of_small_labels_that_fill_a_map_fail_their_gates_with_the_missing
     assert [gate["ok"] for gate in gates] == [False] * 60  # one for each label
     for gate, mesh in zip(gates, report["meshes"], strict=True):
         missing_percent = 100 * abs(mesh["volume_ml"] / mesh["label_ml"] - 1)
-        assert gate["measured"] == pytest.approx(missing_percent, abs=1e-6)
+        assert gate["measured"] == pytest.approx(missing_percent, abs=1e-6)  # digits of the report
         assert gate["bound"] == 1.0 < missing_percent
     error = capsys.readouterr().err
     assert "gate label_volume failed: the mesh has" in error

@@ -25,6 +25,7 @@ def spine(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def sheet_command(spine: Path, device: Any) -> list[str]:
+    """The words for six sagittal slices of the spine in one picture."""
     return ["render", str(spine), "--sheet", "6", "--view", "sagittal", "--device", str(device.index)]
 
 

@@ -27,6 +27,7 @@ def test_text_that_is_no_amount_of_memory_is_refused(text):
 
 @pytest.fixture(scope="module")
 def ct_folder(tmp_path_factory):
+    """A series of 40 slices of 64 x 64 voxels, 328 kB."""
     folder = tmp_path_factory.mktemp("memory") / "ct"
     assert main(["phantom", str(folder), "--kind", "sphere", "--size", "64", "--slices", "40", "-q"]) == 0
     return folder

@@ -77,6 +77,7 @@ class Part:
 
 @pytest.fixture
 def part_parser() -> Parser:
+    """A parser with the options of `Part`."""
     parser = Parser(prog="clrecon")
     add_fields(parser, Part)
     return parser

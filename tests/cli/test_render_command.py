@@ -25,6 +25,7 @@ SIDE = 64
 
 @pytest.fixture(scope="module")
 def ct(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A series in which `BLOCK` lies in air."""
     voxels = np.full(SHAPE_KJI, AIR_HU, np.int16)
     voxels[BLOCK] = BLOCK_HU
     return write_series(tmp_path_factory.mktemp("ct") / "scan", voxels)
@@ -60,6 +61,7 @@ class Renders:
 
 @pytest.fixture
 def render(ct: Path, tmp_path: Path, device: Any, capsys: pytest.CaptureFixture[str]) -> Renders:
+    """Renders `ct`, by its command."""
     return Renders(ct, tmp_path, device, capsys)
 
 

@@ -22,6 +22,7 @@ GIVEN_TWICE = {
 
 @pytest.fixture
 def parser() -> Parser:
+    """A parser with the options of render."""
     parser = Parser()
     add_arguments(parser)
     return parser

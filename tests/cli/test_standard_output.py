@@ -20,6 +20,7 @@ from clrecon.proof.phantom import PhantomSettings, write_phantom
 
 @pytest.fixture(scope="module")
 def ct(tmp_path_factory):
+    """A series of a sphere in 40 x 40 voxels."""
     folder = tmp_path_factory.mktemp("stream") / "ct"
     write_phantom(folder, PhantomSettings(kind="sphere", size=(40, 40)))
     return folder
@@ -142,6 +143,7 @@ def test_output_that_one_stream_cannot_hold_is_refused_in_one_line(ct, capfdbina
 
 @pytest.fixture(scope="module")
 def spine(tmp_path_factory):
+    """A series of L2 to L4 with the label map levels.nrrd."""
     folder = tmp_path_factory.mktemp("stream") / "spine"
     write_phantom(folder, PhantomSettings(size=(72, 72), spacing=(2.5, 2.5, 2.5), levels="L2-L4"))
     return folder

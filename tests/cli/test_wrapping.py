@@ -20,6 +20,7 @@ class Terminal:
 
 @pytest.fixture
 def narrow(monkeypatch):
+    """A terminal of `COLUMNS`."""
     monkeypatch.setenv("COLUMNS", str(COLUMNS))
     monkeypatch.setenv("TERM", "xterm")
 

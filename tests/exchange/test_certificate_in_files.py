@@ -65,6 +65,7 @@ LINES = [
 
 @pytest.fixture
 def mesh() -> Mesh:
+    """A box whose report has the certificate `REPORT`."""
     vertices, triangles = samples.box()
     return Mesh(vertices, triangles, report={"iso_value_hu": 226.0, "certificate": REPORT})
 

@@ -191,7 +191,7 @@ def test_indices_of_voxels_are_read_back_from_an_npz_cloud(cloud_and_npz):
 
 
 @pytest.mark.parametrize("extension", [".ply", ".vtp"])
-def test_pyvista_reads_the_same_points_and_normals(extension, tmp_path):
+def test_pyvista_reads_points_and_normals_of_a_saved_cloud(extension, tmp_path):
     pyvista = pytest.importorskip("pyvista")
     cloud = make_cloud()
     cloud.save(tmp_path / f"bone{extension}", "ras")
@@ -218,7 +218,7 @@ def test_each_point_of_a_vtp_cloud_is_a_vertex_cell(tmp_path):
     assert read.n_verts == read.n_cells == 1000
 
 
-def test_trimesh_reads_the_same_points_and_hu_of_a_ply_cloud(tmp_path):
+def test_trimesh_reads_points_and_hu_of_a_ply_cloud(tmp_path):
     trimesh = pytest.importorskip("trimesh")
     cloud = make_cloud()
     cloud.save(tmp_path / "bone.ply")
@@ -237,7 +237,7 @@ def cloud_and_las(tmp_path):
     return cloud, laspy.read(tmp_path / "bone.las")
 
 
-def test_laspy_reads_the_same_points_and_fields(cloud_and_las):
+def test_laspy_reads_points_and_fields_of_a_las_cloud(cloud_and_las):
     cloud, las = cloud_and_las
     assert np.abs(np.stack([las.x, las.y, las.z], 1) - cloud.points).max() <= tolerances.LAS_POINT_MM
     np.testing.assert_array_equal(las["HU"], cloud.hu)
@@ -278,7 +278,7 @@ def test_hash_of_an_identifier_is_in_a_cloud_file_on_request_alone(extension, ke
 
 
 @pytest.mark.release
-def test_open3d_reads_the_same_points_and_normals_of_a_ply_cloud(tmp_path):
+def test_open3d_reads_points_and_normals_of_a_ply_cloud(tmp_path):
     open3d = pytest.importorskip("open3d", exc_type=ImportError)
     cloud = make_cloud()
     cloud.save(tmp_path / "bone.ply")
@@ -298,7 +298,7 @@ def test_open3d_reads_hu_and_labels_of_a_ply_cloud_as_tensors(tmp_path):
 
 
 @pytest.mark.release
-def test_open3d_reads_the_same_points_of_an_xyz_cloud(tmp_path):
+def test_open3d_reads_points_of_an_xyz_cloud(tmp_path):
     open3d = pytest.importorskip("open3d", exc_type=ImportError)
     cloud = make_cloud()
     cloud.changed(hu=None).save(tmp_path / "bone.xyz")

@@ -84,7 +84,7 @@ def read_polydata(path):
 
 @pytest.mark.parametrize("space", ["lps", "ras"])
 @pytest.mark.parametrize("extension", [e for e in EXTENSIONS if e not in (".vtp", ".html")])
-def test_trimesh_reads_the_same_mesh(mesh, extension, space, tmp_path):
+def test_trimesh_reads_the_mesh_that_was_saved(mesh, extension, space, tmp_path):
     trimesh = pytest.importorskip("trimesh")
     mesh.save(tmp_path / f"bone{extension}", space=space)
     read = trimesh.load_scene(tmp_path / f"bone{extension}", process=False, maintain_order=True).to_mesh()
@@ -105,7 +105,7 @@ def test_saving_a_mesh_returns_the_bytes_of_its_file(mesh, extension, tmp_path):
 
 @pytest.mark.parametrize("space", ["lps", "ras"])
 @pytest.mark.parametrize("extension", [e for e in EXTENSIONS if e not in (".3mf", ".html")])
-def test_vtk_reads_the_same_mesh(mesh, extension, space, tmp_path):
+def test_vtk_reads_the_mesh_that_was_saved(mesh, extension, space, tmp_path):
     mesh.save(tmp_path / f"bone{extension}", space=space)
     points, polydata = read_polydata(tmp_path / f"bone{extension}")
     assert_same_mesh_in_file(mesh, extension, points, polydata.regular_faces, space)
@@ -114,7 +114,7 @@ def test_vtk_reads_the_same_mesh(mesh, extension, space, tmp_path):
 @pytest.mark.parametrize("space", ["lps", "ras"])
 @pytest.mark.parametrize("extension", [".ply", ".obj", ".vtp"])
 @pytest.mark.parametrize("mesh", [True], ids=["normals"], indirect=True)
-def test_vtk_reads_the_same_normals(mesh, extension, space, tmp_path):
+def test_vtk_reads_the_normals_that_were_saved(mesh, extension, space, tmp_path):
     mesh.save(tmp_path / f"bone{extension}", space=space)
     _, polydata = read_polydata(tmp_path / f"bone{extension}")
     normals = np.asarray(polydata.point_data["Normals"])
@@ -501,7 +501,7 @@ def test_more_vertices_than_a_ply_can_number_are_refused_before_anything_is_writ
     assert stream.getvalue() == b""
 
 
-def test_check_of_a_vtp_whose_end_is_wrong_names_the_right_one(mesh, tmp_path):
+def test_check_of_a_vtp_with_a_wrong_end_names_the_end_that_is_missing(mesh, tmp_path):
     mesh.save(tmp_path / "bone.vtp")
     content = (tmp_path / "bone.vtp").read_bytes().rstrip()
     (tmp_path / "bone.vtp").write_bytes(content.removesuffix(b"</VTKFile>") + b"0123456789abcdefghij")

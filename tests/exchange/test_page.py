@@ -171,6 +171,7 @@ def test_page_in_ras_has_its_vertices_in_lps(page_of_two_meshes):
 
 @pytest.fixture
 def page_text(tmp_path):
+    """The HTML of the page of one cube."""
     cubes(1).save(tmp_path / "page.html")
     return (tmp_path / "page.html").read_text(encoding="utf-8")
 

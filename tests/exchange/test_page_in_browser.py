@@ -23,12 +23,14 @@ BOX_CORNER, BOX_SIZE = CENTRE + (50.0, -20.0, -20.0), (20.0, 40.0, 40.0)
 
 @pytest.fixture(scope="module")
 def browser():
+    """A browser for all tests of this file."""
     with open_browser() as driver:
         yield driver
 
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
+    """A page of a sphere of `RADIUS` about `CENTRE`, and a box to the left of it."""
     sphere = samples.sphere(tuple(CENTRE), RADIUS, rounds=5)
     path = tmp_path_factory.mktemp("page") / "page.html"
     mesh = Mesh(*samples.join(sphere, samples.box(tuple(BOX_CORNER), BOX_SIZE)), report={"iso_value_hu": 300.0})
@@ -184,7 +186,7 @@ def test_distance_between_two_clicks_on_the_box_is_that_of_its_points(page):
     assert listed_measures(page) == pytest.approx([np.hypot(18.0, 38.0)], abs=tolerances.PAGE_CLICK_MM)
 
 
-def test_angle_of_three_clicks_at_a_corner_of_the_box_is_a_right_one(page):
+def test_angle_of_three_clicks_at_a_corner_of_the_box_is_90_degrees(page):
     page.find_element("id", "angle").click()
     for corner in ((1.0, 0.0, 39.0), (1.0, 0.0, 1.0), (19.0, 0.0, 1.0)):
         click_point(page, BOX_CORNER + corner)

@@ -77,7 +77,7 @@ def test_scan_with_uneven_slices_is_refused() -> None:
 
 
 @pytest.mark.unit
-def test_page_holds_the_slices_that_its_mesh_has_and_says_so(tmp_path) -> None:
+def test_page_holds_the_slices_that_its_mesh_has_and_tells_their_size(tmp_path) -> None:
     packed = pack_slices(scenes.make_scan(), WINDOWS)
     Mesh(*ball(radius=5.0, rings=12), report={"page_slices": packed}).save(tmp_path / "page.html")
 

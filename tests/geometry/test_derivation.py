@@ -44,6 +44,7 @@ def read_numbers(text: str) -> dict[str, tuple[np.ndarray, float]]:
 
 @pytest.fixture(scope="module")
 def page() -> dict[str, tuple[np.ndarray, float]]:
+    """The numbers of the worked case on the page."""
     return read_numbers(PAGE.read_text(encoding="utf-8").split("## Worked case")[1])
 
 
@@ -132,6 +133,7 @@ def compute_uneven_slices(page) -> dict[str, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def computed(page, volume) -> dict[str, np.ndarray]:
+    """The same numbers as clrecon gives them."""
     return compute_page(page, volume) | compute_uneven_slices(page)
 
 

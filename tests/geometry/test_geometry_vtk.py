@@ -102,7 +102,7 @@ def test_an_image_of_a_mirrored_volume_names_the_turned_order_of_its_slices(numb
     assert ("SLICES" in image.field_data) == ("mirrored" in name)
 
 
-def test_an_image_that_is_not_resampled_does_not_say_so(numbers_and_image):
+def test_an_image_that_is_not_resampled_has_no_note_of_resampling(numbers_and_image):
     _, _, image = numbers_and_image
     assert "RESAMPLED" not in image.field_data
 
@@ -217,13 +217,14 @@ def test_a_resampled_volume_has_air_from_half_a_voxel_beyond_it_on_and_nowhere_e
     assert image["HU"][~is_beyond].min() >= volume.voxels.min() - tolerances.RESAMPLED_RAMP_HU
 
 
-def test_a_resampled_image_says_so(resampled_ramp):
+def test_a_resampled_image_has_a_note_of_its_regular_grid(resampled_ramp):
     _, image, _, _ = resampled_ramp
     assert "regular grid" in image.field_data["RESAMPLED"][0]
 
 
 @pytest.fixture(scope="module", params=irregular_volumes())
 def volume_and_grid(request):
+    """A volume that is sheared or uneven, and its regular grid."""
     volume = irregular_volumes()[request.param]
     return volume, regular_grid(volume, volume.slice_origins())
 
@@ -266,7 +267,7 @@ def test_contours_of_a_resampled_sphere_lie_on_it_but_for_its_sagitta(name):
     gaps = np.linalg.norm(np.diff(volume.slice_origins(), axis=0), axis=1)
     too_long = sum(np.square([*volume.spacing[:2], gaps.max()])) + sum(np.square(image.spacing))
     assert radii.max() <= RADIUS + tolerances.IMAGE_SURFACE_MM
-    assert radii.min() >= RADIUS - too_long / (8.0 * (RADIUS - 1.0))
+    assert radii.min() >= RADIUS - too_long / (8.0 * (RADIUS - 1.0))  # cells reach 1 mm into the sphere
 
 
 def test_a_resampled_volume_of_unsigned_integers_keeps_its_type_with_0_for_air():

@@ -136,7 +136,7 @@ def assert_same_voxels_at_same_places(volume: Volume, other: Volume) -> None:
 
 @of_every_affine
 @pytest.mark.parametrize("extension", [".nii.gz", ".nrrd", ".mha"])
-def test_a_saved_volume_is_read_the_same_by_clrecon_and_simpleitk(tmp_path, name, extension):
+def test_clrecon_and_simpleitk_read_each_voxel_of_a_saved_volume_in_place(tmp_path, name, extension):
     volume = numbered_volume(AFFINES[name])
     path = tmp_path / f"ct{extension}"
     volume.save(path)
@@ -145,7 +145,7 @@ def test_a_saved_volume_is_read_the_same_by_clrecon_and_simpleitk(tmp_path, name
 
 
 @of_every_affine
-def test_a_saved_nifti_is_read_the_same_by_nibabel(tmp_path, name):
+def test_nibabel_reads_each_voxel_of_a_saved_nifti_in_place(tmp_path, name):
     volume = numbered_volume(AFFINES[name])
     volume.save(tmp_path / "ct.nii.gz")
     assert_same_voxels_at_same_places(volume, Volume.from_nibabel(nibabel.load(tmp_path / "ct.nii.gz")))

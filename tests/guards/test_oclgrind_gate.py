@@ -43,6 +43,7 @@ def check_kernel(statement: str, *options: str) -> subprocess.CompletedProcess[s
 
 @pytest.fixture
 def oclgrind() -> str:
+    """The path of Oclgrind; skips where it is missing."""
     path = shutil.which("oclgrind")
     if path is None or importlib.util.find_spec("pyopencl") is None:
         if os.environ.get("CLRECON_REQUIRE_OCLGRIND"):

@@ -194,6 +194,7 @@ for_a_release = pytest.mark.release
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel of this project."""
     return build_wheel(tmp_path_factory.mktemp("wheel"))
 
 
