@@ -17,7 +17,7 @@ from typing import IO, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.errors import OutputError
+from clrecon.errors import OutputError, UsageError
 from clrecon.exchange.page_slices import PackedSlices
 from clrecon.geometry import frame_from_lps
 from clrecon.system.light_dataclass import dataclass, field
@@ -116,6 +116,23 @@ def _plain(text: str) -> str:
     return line if len(line) <= LINE_LENGTH else line[: LINE_LENGTH - 3] + "..."
 
 
+def checked_columns(
+    owner: str, columns: Mapping[str, NDArray[np.floating]], unit: str, count: int
+) -> dict[str, NDArray[np.float32]]:
+    """Return numbers by name as float32; those not one a unit, or with a name that no file holds, are refused."""
+    checked = {}
+    for name, values in columns.items():
+        array = np.asarray(values)
+        if array.shape != (count,) or array.dtype.kind not in "biuf":
+            raise UsageError(
+                f"{owner}[{name!r}] are {array.dtype} of shape {array.shape}: one number a {unit} is needed, ({count},)"
+            )
+        if not isinstance(name, str) or not (name.isascii() and name.isidentifier()):
+            raise UsageError(f"values have names of letters, digits and _ that begin with a letter, not {name!r}")
+        checked[name] = np.ascontiguousarray(array, np.float32)
+    return checked
+
+
 _LINES_AT_ONCE = 1 << 14
 BONE_COLOR = (0.89, 0.86, 0.78)
 """Colour of a surface without one of its own, in formats that must have one."""
@@ -131,7 +148,7 @@ class PointContent:
     certificate: Facts about the volume; one printable ASCII line each.
     inside: The values that the surface encloses, for example "below -400 HU"; None for those from the iso value on.
     hu, labels, ijk: (n,), (n,) and (n, 3).
-    values: Numbers at the vertices of a mesh by name, (n,), in PLY, VTP and GLB; NaN where there is none.
+    values: Numbers at the points by name, (n,), in PLY, VTP, NPZ and GLB; NaN where there is none.
     """
 
     vertices: NDArray[np.floating]

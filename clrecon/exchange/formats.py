@@ -205,9 +205,11 @@ def describe_cloud_losses(content: PointContent, extension: str) -> list[str]:
         for name, word in names.items()
         if getattr(content, name) is not None and name not in _KEPT.get(extension, _KEPT_BY_OTHERS)
     ]
+    lost += [name for name in content.values if extension in (".xyz", ".las")]
     if not lost:
         return []
-    return [f"{extension[1:].upper()} has no place for {' and '.join(lost)}: PLY, VTP, NPZ and LAS have"]
+    others = "PLY, VTP and NPZ" if content.values else "PLY, VTP, NPZ and LAS"
+    return [f"{extension[1:].upper()} has no place for {' and '.join(lost)}: {others} have"]
 
 
 def write_cloud(

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Mapping
 from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -29,7 +30,7 @@ from numpy.typing import NDArray
 from clrecon.errors import RefusedInputError
 from clrecon.exchange.content import BONE_COLOR, Assembly, Content, check_same, parts_of, refuse_file
 from clrecon.exchange.coordinates import find_places
-from clrecon.exchange.raw_content import MOST_LEVELS, Part, PlacedShapes, RawMesh, Shape, say_cut
+from clrecon.exchange.raw_content import MOST_LEVELS, Part, PlacedShapes, RawMesh, Shape, numbers_of, say_cut
 from clrecon.system.paths import open_regular
 from clrecon.system.pieces import list_distinct, local_origin
 from clrecon.system.text import escape_text
@@ -93,6 +94,8 @@ def _document(content: Content | Assembly) -> dict[str, Any]:
         extras["inside"] = first.inside
     if first.certificate:
         extras["certificate"] = list(first.certificate)
+    if names := dict.fromkeys(chain(*(part.values for part in parts))):
+        extras["values"] = list(names)
     return {
         "asset": {"version": "2.0", "generator": "clrecon", "extras": extras},
         "scene": 0,
@@ -273,6 +276,8 @@ def _collect_mesh(file: _File, name: str) -> RawMesh:
         space = None
     shapes, left_out = PlacedShapes(), 0
 
+    names = {f"_{name.upper()}": name for name in extras.get("values", ()) if isinstance(name, str)}
+
     def visit(number: Any, above: NDArray[np.float64], level: int) -> None:
         nonlocal left_out
         if level > MOST_LEVELS:
@@ -281,7 +286,7 @@ def _collect_mesh(file: _File, name: str) -> RawMesh:
         node = file.entry("nodes", number)
         matrix = above @ _place_of(node)
         if "mesh" in node:
-            left_out += _add_mesh(file, node, matrix, shapes, joins=space is None)
+            left_out += _add_mesh(file, node, matrix, shapes, names, joins=space is None)
         for child in node.get("children", ()):
             visit(child, matrix, level + 1)
 
@@ -301,6 +306,7 @@ def _collect_mesh(file: _File, name: str) -> RawMesh:
         [f"elements left out: {left_out:,} sets of points or lines"] if left_out else [],
         "m",
         shapes.parts,
+        mesh.values,
     )
 
 
@@ -314,9 +320,18 @@ def _roots(file: _File) -> list[Any]:
 
 
 def _add_mesh(
-    file: _File, node: dict[str, Any], matrix: NDArray[np.float64], shapes: PlacedShapes, *, joins: bool
+    file: _File,
+    node: dict[str, Any],
+    matrix: NDArray[np.float64],
+    shapes: PlacedShapes,
+    names: Mapping[str, str],
+    *,
+    joins: bool,
 ) -> int:
-    """Add the triangles of a mesh; return the number of its primitives that are no triangles."""
+    """Add the triangles of a mesh; return the number of its primitives that are no triangles.
+
+    names: Of the numbers at vertices, by the attribute that has them.
+    """
     mesh = file.entry("meshes", node["mesh"])
     name = str(node.get("name") or mesh.get("name") or "")
     if not joins and name == _NAMELESS:
@@ -339,11 +354,24 @@ def _add_mesh(
             triangles = file.values(primitive["indices"], 1, "u").ravel().astype(np.int64)
         if len(triangles) % 3:
             raise ValueError(f"{len(triangles):,} corners are not those of whole triangles")
-        shape = Shape(vertices, triangles.reshape(-1, 3), normals)
+        columns = {
+            name: _known_of(file.values(attributes[attribute], 1, "f")[:, 0])
+            for attribute, name in names.items()
+            if attribute in attributes
+        }
+        if any(len(column) != len(vertices) for column in columns.values()):
+            raise ValueError(f"not one number for each of {len(vertices):,} vertices")
+        shape = Shape(vertices, triangles.reshape(-1, 3), normals, numbers_of(columns))
         shapes.add(
             _joined(shape) if joins else shape, matrix, Part(name, len(shape.triangles), _color(file, primitive))
         )
     return left_out
+
+
+def _known_of(values: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return numbers with NaN for -1, which stands for it in columns without other numbers below 0."""
+    is_signed = bool(((values < 0.0) & (values != -1.0)).any())
+    return values if is_signed else np.where(values == -1.0, np.nan, values)
 
 
 def _joined(shape: Shape) -> Shape:

@@ -4,6 +4,7 @@
 |---|---|
 | ``points`` | (n, 3) float32, or float64 far from the origin; mm in ``space`` |
 | ``normals``, ``hu`` | (n, 3) and (n,) float32, where known |
+| ``thickness_mm``, ``error_mm`` | (n,) float32, of points on the cortex |
 | ``labels``, ``ijk`` | (n,) and (n, 3) int32, where known |
 | ``space``, ``unit``, ``inside`` | texts |
 | ``iso_value_hu`` | a number |
@@ -46,6 +47,7 @@ def _arrays(content: PointContent) -> dict[str, NDArray[Any]]:
         "hu": content.hu,
         "labels": content.labels,
         "ijk": content.ijk,
+        **content.values,
         "affine": content.affine,
         "iso_value_hu": None if content.iso_value_hu is None else np.array(content.iso_value_hu),
         "inside": None if content.inside is None else np.array(content.inside),
@@ -107,9 +109,9 @@ def read_cloud(path: Path) -> RawCloud:
                     f"{name} is an archive without points: an entry {', '.join(_POINTS)} of shape (n, 3) is needed"
                 )
             arrays = {"points": _read_array(archive, entries[points])}
-            for entry in ("normals", "hu", "labels", "ijk", "space", "affine", "iso_value_hu", "certificate"):
-                if entry in entries:
-                    arrays[entry] = _read_array(archive, entries[entry])
+            known = ("normals", "hu", "labels", "ijk", "space", "affine", "iso_value_hu", "certificate")
+            for entry in [*(name for name in known if name in entries), *(n for n in entries if n.endswith("_mm"))]:
+                arrays[entry] = _read_array(archive, entries[entry])
     except (
         zipfile.BadZipFile, zlib.error, ValueError, EOFError, OSError, NotImplementedError, RuntimeError, MemoryError,
     ) as error:  # fmt: skip
@@ -138,6 +140,7 @@ def _describe_cloud(name: str, arrays: dict[str, NDArray[Any]]) -> RawCloud:
         ("ijk", "(n, 3)", ("i", "j", "k")),
         ("hu", "(n,)", ("hu",)),
         ("labels", "(n,)", ("labels",)),
+        *((entry, "(n,)", (entry,)) for entry in arrays if entry.endswith("_mm")),
     ):
         values = arrays.get(entry)
         if values is None:

@@ -36,36 +36,49 @@
       index[i] = next - code;
       if (code === 0) next++;
     }
-    return { place, normal, index };
+    const columns = (facts.values || []).map((_, column, all) => {
+      const codes = new Uint16Array(n), low = first + 4 * m + column * n, high = low + all.length * n;
+      for (let i = 0, at = 0; i < n; i++) codes[i] = at = (at + unfold(planes[low + i] | (planes[high + i] << 8))) & 65535;
+      return codes;
+    });
+    return { place, normal, index, columns };
   }
 
   // Drawing.  Positions on the device are mm from the lowest corner of the box.
 
   const VERTEX = `#version 300 es
     uniform vec3 span, centre, middle; uniform mat3 turn; uniform vec2 halfSize; uniform float reach;
-    in vec3 place, normal; out vec3 at, facing;
+    in vec3 place, normal; in vec2 number; out vec3 at, facing; out vec2 share;
     void main() {
+      share = number;
       at = span * place;
       facing = turn * normal;
       gl_Position = vec4((turn * (at - centre)).xy / halfSize, -(turn * (at - middle)).z / reach, 1.0);
     }`;
   const SHADE = `#version 300 es
     precision highp float;
-    uniform vec4 color, cut; in vec3 at, facing; out vec4 shown;
+    uniform vec4 color, cut; uniform vec2 scale; uniform vec3 table[7]; in vec3 at, facing; in vec2 share; out vec4 shown;
+    vec3 paint() {
+      if (scale.y == 0.0) return color.rgb;
+      if (share.y < 0.999) return vec3(0.5);
+      float step = 6.0 * clamp(scale.x + scale.y * share.x, 0.0, 1.0), below = min(floor(step), 5.0);
+      return mix(table[int(below)], table[int(below) + 1], step - below);
+    }
     void main() {
       if (dot(at, cut.xyz) > cut.w) discard;
       vec3 n = normalize(facing) * (gl_FrontFacing ? 1.0 : -1.0);
       float light = max(dot(n, normalize(vec3(-0.25, 0.35, 1.0))), 0.0);
-      vec3 lit = color.rgb * (0.22 + 0.78 * light) + 0.10 * pow(light, 24.0);
+      vec3 lit = paint() * (0.22 + 0.78 * light) + 0.10 * pow(light, 24.0);
       shown = vec4(gl_FrontFacing ? lit : 0.6 * lit, color.a);
     }`;
   // The exact place under the middle of a pixel: what a click picks.
   const PICK = `#version 300 es
     precision highp float; precision highp int;
-    uniform vec4 cut; uniform uint part; in vec3 at, facing; out uvec4 picked;
+    uniform vec4 cut; uniform uint part; in vec3 at, facing; in vec2 share; out uvec4 picked;
     void main() {
       if (dot(at, cut.xyz) > cut.w) discard;
-      picked = uvec4(floatBitsToUint(at), part);
+      uint number = share.y < 0.999 ? 65535u : uint(65534.0 * share.x + 0.5);
+      picked = uvec4(floatBitsToUint(at), (number << 16) | part);
     }`;
   const gl = scene.getContext("webgl2", { antialias: true });
   if (!gl || typeof DecompressionStream === "undefined") {
@@ -84,6 +97,7 @@
     }
     gl.bindAttribLocation(program, 0, "place");
     gl.bindAttribLocation(program, 1, "normal");
+    gl.bindAttribLocation(program, 2, "number");
     gl.linkProgram(program);
     if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program));
     return { program, at: new Proxy({}, { get: (_, name) => gl.getUniformLocation(program, name) }) };
@@ -96,7 +110,8 @@
   const camera = { turn: [], centre: middle, mm: 1, fits: "A" };
   const clip = { direction: "", along: [1, 0, 0], share: 0.5, flipped: false };
   let slices = null;  // of a page that has some
-  let measures = [], tool = "", picks = [], coarse = false, asked = false, shade, pick, pickTarget;
+  let columns = [], painted = null;  // numbers at the vertices, and which of them colours show
+  let measures = [], tool = "", picks = [], coarse = false, asked = false, shade, pick, pickTarget, numberBuffer;
 
   const VIEWS = { A: [0, -1, 0], P: [0, 1, 0], L: [1, 0, 0], R: [-1, 0, 0], S: [0, 0, 1], I: [0, 0, -1] };
 
@@ -127,6 +142,24 @@
     gl.uniform2f(at.halfSize, (width * mm) / 2, (height * mm) / 2);
     gl.uniform1f(at.reach, reach);
     gl.uniform4fv(at.cut, cutPlane());
+    if (tools !== shade) return;
+    const { low, step, ticks, colors } = painted || {}, wide = painted && ticks[4] - ticks[0];
+    gl.uniform2fv(at.scale, painted ? [(low - ticks[0]) / wide, (65534 * step) / wide] : [0, 0]);
+    if (painted) gl.uniform3fv(at.table, colors.flatMap(channels));
+  }
+
+  const sayNumber = (value) => String(Number(value.toPrecision(3)));
+  const nameOf = (column) => column.name.slice(0, -3).replace(/_/g, " ");
+
+  function choosePaint(name) {
+    const row = (facts.values || []).findIndex((column) => column.name === name), shares = new Float32Array(2 * facts.vertices);
+    painted = row < 0 ? null : facts.values[row];
+    if (painted) {
+      columns[row].forEach((code, i) => { if (code !== 65535) shares.set([code / 65534, 1], 2 * i); });
+    }
+    gl.bindBuffer(gl.ARRAY_BUFFER, numberBuffer);
+    gl.bufferData(gl.ARRAY_BUFFER, shares, gl.STATIC_DRAW);
+    redraw();
   }
 
   const drawPart = (part) => gl.drawElements(gl.TRIANGLES, 3 * part.count, gl.UNSIGNED_INT, 12 * part.first);
@@ -195,7 +228,8 @@
     gl.readPixels(0, 0, 1, 1, gl.RGBA_INTEGER, gl.UNSIGNED_INT, found);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     if (!found[3]) return null;
-    return { point: Array.from(new Float32Array(found.buffer, 0, 3)), part: found[3] - 1 };
+    const code = found[3] >>> 16, number = painted && code < 65535 ? painted.low + painted.step * code : null;
+    return { point: Array.from(new Float32Array(found.buffer, 0, 3)), part: (found[3] & 65535) - 1, number };
   }
 
   const toPatient = (point) => point.map((value, axis) => value + facts.low[axis]);
@@ -243,6 +277,17 @@
     line([[16, height - 22], [16, height - 16], [end, height - 16], [end, height - 22]]);
     pen.textAlign = "left";
     write(sayLength(length), 16, height - 32);
+    if (painted) {
+      const top = 44, tall = Math.min(180, height / 2 - 90), bar = pen.createLinearGradient(0, top + tall, 0, top);
+      painted.colors.forEach((color, n) => bar.addColorStop(n / 6, color));
+      pen.fillStyle = bar;
+      pen.fillRect(16, top, 16, tall);
+      pen.lineWidth = 1;
+      pen.strokeStyle = ink;
+      pen.strokeRect(16, top, 16, tall);
+      write(`${nameOf(painted)}, mm`, 16, 24);
+      painted.ticks.forEach((tick, n) => write(sayNumber(tick), 38, top + tall * (1 - n / 4)));
+    }
     if (slices) {
       const [x, y] = project(minus(slices.place(), facts.low));
       line([[x - 9, y], [x + 9, y]]);
@@ -270,17 +315,18 @@
   }
 
   function click(x, y) {
-    if (!tool && !slices) return;
+    if (!tool && !slices && !painted) return;
     const found = pickAt(x, y);
     if (found && slices) slices.moveTo(toPatient(found.point));
-    if (!tool) return;
+    if (!tool && !painted) return;
     if (!found) {
       find("hint").textContent = "There is no surface.";
       return;
     }
-    picks.push(found.point);
+    if (tool) picks.push(found.point);
     const place = inSpace(toPatient(found.point)).map((value) => value.toFixed(1)).join(", ");
-    find("hint").textContent = `${parts[found.part].name}: ${facts.space} (${place}) mm`;
+    const number = !painted ? "" : `, ${nameOf(painted)} ${found.number === null ? "not known" : `${sayNumber(found.number)} mm`}`;
+    find("hint").textContent = `${parts[found.part].name}: ${facts.space} (${place}) mm${number}`;
     if (picks.length === { distance: 2, angle: 3 }[tool]) {
       measures.push({ kind: tool, points: picks });
       picks = [];
@@ -339,6 +385,9 @@
   find("depth").oninput = () => { clip.share = Number(find("depth").value); redraw(); };
   find("all").onclick = () => showAll(true);
   find("none").onclick = () => showAll(false);
+  for (const column of facts.values || []) find("paint").append(element("option", nameOf(column), { value: column.name }));
+  find("paint").onchange = () => choosePaint(find("paint").value);
+  find("numbers").hidden = !facts.values;
   listParts();
   find("about").replaceChildren(...facts.about.map((text) => element("p", text)));
 
@@ -426,7 +475,8 @@
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
 
   try {
-    const { place, normal, index } = decode(await unpack("surface"));
+    const decoded = decode(await unpack("surface")), { place, normal, index } = decoded;
+    columns = decoded.columns;
     shade = link(SHADE);
     pick = link(PICK);
     for (const [slot, kind, values, isUnit] of [[0, gl.UNSIGNED_SHORT, place, false], [1, gl.BYTE, normal, true]]) {
@@ -434,6 +484,12 @@
       gl.bufferData(gl.ARRAY_BUFFER, values, gl.STATIC_DRAW);
       gl.enableVertexAttribArray(slot);
       gl.vertexAttribPointer(slot, 3, kind, isUnit, 4 * values.BYTES_PER_ELEMENT, 0);
+    }
+    if (facts.values) {
+      numberBuffer = gl.createBuffer();
+      choosePaint(find("paint").value = facts.values[0].name);
+      gl.enableVertexAttribArray(2);
+      gl.vertexAttribPointer(2, 2, gl.FLOAT, false, 0, 0);
     }
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, index, gl.STATIC_DRAW);

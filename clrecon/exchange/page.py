@@ -9,7 +9,7 @@ The surface is coded as bytes; decoding is the twin of what ``page.js`` does.  V
 their first use, so that most indices are near to the highest one so far. Positions are 16-bit steps within the bounding
 box.  Differences of neighbours are small; signs are folded into the lowest bit (zigzag), and bytes of equal weight
 stand together (byte planes), which deflate packs best: planes of x, y, z of the positions (low bytes, then high bytes),
-of x, y, z of the normals, and four of the indices.
+of x, y, z of the normals, four of the indices, and two of each number in mm at the vertices.
 """
 
 from __future__ import annotations
@@ -31,13 +31,15 @@ from numpy.typing import NDArray
 from clrecon.errors import UsageError
 from clrecon.exchange.content import BONE_COLOR, Assembly, Content, check_same, parts_of, refuse_file
 from clrecon.exchange.page_slices import PackedSlices, describe_slices
+from clrecon.exchange.raw_content import join_numbers
+from clrecon.system.color_scale import ColorScale
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.packing import GZIP, find_deflate, start_packing
 from clrecon.system.pieces import find_bounds, side_by_side
 from clrecon.version import package_version
 
 STEPS = 65_535
-"""Steps of a coordinate along a side of the bounding box."""
+"""Steps of a coordinate along a side of the bounding box; of a number at a vertex this one means that none is known."""
 
 _NORMAL_SCALE = 127.0
 _LEVEL = 4
@@ -46,13 +48,17 @@ _LEVEL = 4
 
 @dataclass(frozen=True, eq=False)
 class CodedSurface:
-    """A surface as a page holds it: counts, lowest corner and steps of coordinates, mm, and gzip of the byte planes."""
+    """A surface as a page holds it: counts, lowest corner and steps of coordinates, mm, and gzip of the byte planes.
+
+    columns: How many numbers each vertex has.
+    """
 
     vertices: int
     triangles: int
     low_mm: tuple[float, ...]
     step_mm: tuple[float, ...]
     data: bytes
+    columns: int = 0
 
     @property
     def half_step_mm(self) -> float:
@@ -61,9 +67,15 @@ class CodedSurface:
 
 
 def encode_surface(
-    vertices: NDArray[np.floating], normals: NDArray[np.float32], triangles: NDArray[np.integer]
+    vertices: NDArray[np.floating],
+    normals: NDArray[np.float32],
+    triangles: NDArray[np.integer],
+    numbers: NDArray[np.uint16] | None = None,
 ) -> CodedSurface:
-    """Code a surface of at least one triangle, whose order stays; normals (n, 3) are unit vectors."""
+    """Code a surface of at least one triangle, whose order stays; normals (n, 3) are unit vectors.
+
+    numbers: ndarray, shape (n, k). What vertices have beside their place, in steps.
+    """
     order, corners = _renumber(triangles, len(vertices))
     places = vertices[order].astype(np.float64)
     low, high = find_bounds(places)
@@ -83,8 +95,10 @@ def encode_surface(
         return _split_planes(codes.astype(np.uint32)[:, None])
 
     packed, codes = side_by_side(pack_vertices, code_corners)
-    data = packed + packer.compress(codes) + packer.flush()
-    return CodedSurface(len(order), len(triangles), tuple(low.tolist()), tuple(step.tolist()), data)
+    numbers = np.empty((len(vertices), 0), np.uint16) if numbers is None else numbers
+    data = packed + packer.compress(codes) + packer.compress(_split_planes(_fold(numbers[order], np.uint16, np.int16)))
+    corner, sides = tuple(low.tolist()), tuple(step.tolist())
+    return CodedSurface(len(order), len(triangles), corner, sides, data + packer.flush(), numbers.shape[1])
 
 
 def decode_surface(coded: CodedSurface) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.uint32]]:
@@ -93,7 +107,7 @@ def decode_surface(coded: CodedSurface) -> tuple[NDArray[np.float64], NDArray[np
     n = coded.vertices
     positions = _unfold(_join_planes(data[: 6 * n], 3, np.uint16), np.uint16)
     turned = _unfold(_join_planes(data[6 * n : 9 * n], 3, np.uint8), np.uint8).view(np.int8)
-    codes = _join_planes(data[9 * n :], 1, np.uint32)[:, 0].astype(np.int64)
+    codes = _join_planes(data[9 * n : 9 * n + 12 * coded.triangles], 1, np.uint32)[:, 0].astype(np.int64)
     # A code of 0 is a vertex that was not there before: the highest so far is the number of these, less one.
     new = np.cumsum(codes == 0)
     indices = np.concatenate(([0], new[:-1])) - codes
@@ -104,13 +118,23 @@ def decode_surface(coded: CodedSurface) -> tuple[NDArray[np.float64], NDArray[np
     return vertices, normals, indices.reshape(-1, 3).astype(np.uint32)
 
 
+def decode_values(facts: dict[str, Any], coded: CodedSurface) -> dict[str, NDArray[np.float64]]:
+    """Return the numbers in mm at the vertices of a page by name, NaN where none is known."""
+    planes = _unpack_planes(coded)[9 * coded.vertices + 12 * coded.triangles :]
+    codes = _unfold(_join_planes(planes, coded.columns, np.uint16), np.uint16).T
+    return {
+        column["name"]: np.where(own == STEPS, np.nan, column["low"] + column["step"] * own)
+        for column, own in zip(facts.get("values", ()), codes, strict=True)
+    }
+
+
 def _unpack_planes(coded: CodedSurface) -> NDArray[np.uint8]:
     deflate = find_deflate()
     try:
         data = np.frombuffer(deflate.decompress(coded.data, GZIP), np.uint8)
     except deflate.error as error:
         raise ValueError(f"the data of the surface cannot be unpacked: {error}") from error
-    expected = 9 * coded.vertices + 12 * coded.triangles
+    expected = (9 + 2 * coded.columns) * coded.vertices + 12 * coded.triangles
     if len(data) != expected:
         raise ValueError(f"the surface has {len(data):,} bytes, {expected:,} expected")
     return data
@@ -178,7 +202,8 @@ def compose_page(content: Content | Assembly) -> bytes:
             f"{count:,} triangles are too many for a page, at most {MOST_TRIANGLES:,} are shown: keep the largest parts"
             " only, or decimate the mesh, or write .glb or .ply"
         )
-    coded, parts = _join_parts(meshes)
+    columns, numbers = _code_values(meshes)
+    coded, parts = _join_parts(meshes, numbers)
     slices = next((mesh.slices for mesh in meshes if mesh.slices is not None), None)
     facts: dict[str, Any] = {
         "vertices": coded.vertices,
@@ -190,6 +215,8 @@ def compose_page(content: Content | Assembly) -> bytes:
         "parts": parts,
         "about": _describe_meshes(meshes, coded),
     }
+    if columns:
+        facts["values"] = columns
     if slices is not None:
         facts |= {"slices": slices.facts, "about": [describe_slices(slices.facts), *facts["about"]]}
     # "<" would end the block: in JSON it can stand as an escape.
@@ -217,7 +244,9 @@ def parse_page(page: bytes) -> tuple[dict[str, Any], CodedSurface]:
         raise ValueError("this is no page of a surface")
     facts = json.loads(blocks["facts"])
     data = base64.b64decode(blocks["surface"], validate=True)
-    return facts, CodedSurface(facts["vertices"], facts["triangles"], tuple(facts["low"]), tuple(facts["step"]), data)
+    corner, sides = tuple(facts["low"]), tuple(facts["step"])
+    columns = len(facts.get("values", ()))
+    return facts, CodedSurface(facts["vertices"], facts["triangles"], corner, sides, data, columns)
 
 
 def parse_slices(page: bytes) -> PackedSlices | None:
@@ -243,7 +272,28 @@ def verify(path: Path, content: Content | Assembly) -> None:
     check_same("triangles", coded.triangles, sum(len(part.triangles) for part in parts_of(content)))
 
 
-def _join_parts(meshes: Sequence[Content]) -> tuple[CodedSurface, list[dict[str, Any]]]:
+def _code_values(meshes: Sequence[Content]) -> tuple[list[dict[str, Any]], NDArray[np.uint16]]:
+    """Return names, steps and scales of the numbers in mm at the vertices, and these, (n, k), in steps of their range.
+
+    Where none is known it is `STEPS`.
+    """
+    joined = join_numbers([(mesh.values, len(mesh.vertices)) for mesh in meshes])
+    columns, codes = list[dict[str, Any]](), [np.empty((sum(len(mesh.vertices) for mesh in meshes), 0), np.uint16)]
+    for name, values in joined.items():
+        scale = ColorScale.spanning(values) if name.endswith("_mm") else None
+        if scale is None:
+            continue
+        known = np.isfinite(values)
+        low, high = float(values[known].min()), float(values[known].max())
+        step = (high - low) / (STEPS - 1) or 1.0
+        places = np.rint((np.where(known, values, low).astype(np.float64) - low) / step)
+        codes.append(np.where(known, places, STEPS).astype(np.uint16)[:, None])
+        colors = [_hexadecimal(color / 255.0) for color in scale.table]
+        columns.append({"name": name, "low": low, "step": step, "ticks": scale.ticks, "colors": colors})
+    return columns, np.concatenate(codes, axis=1)
+
+
+def _join_parts(meshes: Sequence[Content], numbers: NDArray[np.uint16]) -> tuple[CodedSurface, list[dict[str, Any]]]:
     """Code all meshes as one surface whose triangles are sorted by part, and list the parts."""
     vertices, normals = [], []
     triangles, parts = [], []
@@ -264,7 +314,7 @@ def _join_parts(meshes: Sequence[Content]) -> tuple[CodedSurface, list[dict[str,
             color = _hexadecimal(BONE_COLOR if mesh.color is None else mesh.color)
             parts.append({"name": named or "surface", "color": color, "ml": ml, "first": first, "count": count})
             first += count
-    coded = encode_surface(np.concatenate(vertices), np.concatenate(normals), np.concatenate(triangles))
+    coded = encode_surface(np.concatenate(vertices), np.concatenate(normals), np.concatenate(triangles), numbers)
     return coded, parts
 
 

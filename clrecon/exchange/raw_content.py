@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -101,6 +102,13 @@ class RawCloud:
         columns = self._take(("i", "j", "k")) if self.kind == "NPZ" else None
         return None if columns is None else np.stack(columns, axis=1).astype(np.int32)
 
+    def values(self) -> dict[str, NDArray[np.float32]]:
+        """Return the numbers in mm at the points, shape (n,) each: columns ``NAME_mm`` or ``scalar_NAME_mm``."""
+        named = {name.removeprefix("scalar_"): name for name in self.columns if name.endswith("_mm")}
+        numbers = numbers_of({name: self.columns[own] for name, own in named.items()})
+        self._used |= {named[name] for name in numbers}
+        return numbers
+
     def unused(self) -> list[str]:
         """Return the warning about columns that were not taken, if there are any."""
         others = [escape_text(name) for name in self.columns if name not in self._used]
@@ -121,6 +129,15 @@ def numbers_of(columns: Mapping[str, Any]) -> dict[str, NDArray[np.float32]]:
             for name, each in arrays.items()
             if each.ndim == 1 and each.dtype.kind in "biuf"
         }
+
+
+def join_numbers(parts: Sequence[tuple[Mapping[str, NDArray[np.floating]], int]]) -> dict[str, NDArray[np.floating]]:
+    """Join numbers by name, of so many vertices or triangles each; NaN where a part has none."""
+    names = dict.fromkeys(chain(*(names for names, _ in parts)))
+    return {
+        name: np.concatenate([own.get(name, np.full(count, np.nan, np.float32)) for own, count in parts])
+        for name in names
+    }
 
 
 def read_remarks(lines: Iterable[str]) -> dict[str, Any]:
@@ -230,6 +247,7 @@ class Shape:
     vertices: NDArray[np.floating]
     triangles: NDArray[np.integer]
     normals: NDArray[np.float32] | None = None
+    values: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
 
 
 @dataclass
@@ -238,6 +256,7 @@ class PlacedShapes:
     _vertices: list[NDArray[np.floating]] = field(default_factory=list)
     _triangles: list[NDArray[np.int64]] = field(default_factory=list)
     _normals: list[NDArray[np.float32] | None] = field(default_factory=list)
+    _values: list[tuple[Mapping[str, NDArray[np.float32]], int]] = field(default_factory=list)
     _count: int = 0
     _corners: int = 0
     _steps: int = 0
@@ -270,6 +289,7 @@ class PlacedShapes:
         if wrong.any():
             raise ValueError(f"a triangle refers to vertex {int(triangles[wrong][0]):,} of {len(vertices):,}")
         self._triangles.append(triangles.astype(np.int64) + self._count)
+        self._values.append((shape.values, len(vertices)))
         self._normals.append(_turned(shape.normals, np.linalg.inv(turn).T if is_moved else None))
         self._count += len(vertices)
         self.parts.append(part)
@@ -283,6 +303,7 @@ class PlacedShapes:
             np.concatenate(self._vertices),
             np.concatenate(self._triangles),
             np.concatenate(normals) if len(normals) == len(self._normals) else None,
+            join_numbers(self._values),
         )
 
 

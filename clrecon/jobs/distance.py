@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from clrecon.mesh.quality import MeshQuality
     from clrecon.opencl import Device
     from clrecon.rendering import Rendering
-    from clrecon.rendering.looks.colors import ColorScale
+    from clrecon.system.color_scale import ColorScale
     from clrecon.system.files import StagedFile
 
 
@@ -110,7 +110,7 @@ def measure_meshes(
         apart = compare_sides(meshes, rulers, settings.samples or SAMPLES, run.progress)
         colored = None
         if files.output is not None or files.picture is not None:
-            from clrecon.rendering.looks.colors import ColorScale, round_up
+            from clrecon.system.color_scale import ColorScale, round_up
 
             distances = rulers[0].measure(meshes[0].vertices, run.progress)
             limit = settings.range_mm or round_up(max(apart.to_reference_mm.p95, _LEAST_RANGE_MM))

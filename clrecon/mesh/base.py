@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -11,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
-from clrecon.exchange.content import Content, facts_for_file
+from clrecon.exchange.content import Content, checked_columns, facts_for_file
 from clrecon.exchange.coordinates import as_stored, rows_of_three
 from clrecon.exchange.formats import write_mesh
 from clrecon.exchange.raw_content import turn_to_lps
@@ -36,22 +35,6 @@ def _as_indices(values: ArrayLike) -> NDArray[np.uint32]:
         if low < 0 or high >= _MOST_VERTICES:
             raise UsageError(f"triangles hold indices from {low} to {high}: they must fit 32 bits without a sign")
     return np.ascontiguousarray(array, dtype=np.uint32)
-
-
-def _checked_columns(
-    owner: str, columns: Mapping[str, NDArray[np.floating]], unit: str, count: int
-) -> dict[str, NDArray[np.float32]]:
-    checked = {}
-    for name, values in columns.items():
-        array = np.asarray(values)
-        if array.shape != (count,) or array.dtype.kind not in "biuf":
-            raise UsageError(
-                f"{owner}[{name!r}] are {array.dtype} of shape {array.shape}: one number a {unit} is needed, ({count},)"
-            )
-        if not isinstance(name, str) or not (name.isascii() and name.isidentifier()):
-            raise UsageError(f"values have names of letters, digits and _ that begin with a letter, not {name!r}")
-        checked[name] = np.ascontiguousarray(array, np.float32)
-    return checked
 
 
 class BaseMesh(Message):
@@ -130,11 +113,11 @@ class BaseMesh(Message):
 
     def checked_values(self) -> dict[str, NDArray[np.float32]]:
         """Return `values` as float32, refusing those that are no number a vertex, or have a name that no file holds."""
-        return _checked_columns("values", self.values, "vertex", self.vertex_count)
+        return checked_columns("values", self.values, "vertex", self.vertex_count)
 
     def checked_face_values(self) -> dict[str, NDArray[np.float32]]:
         """Return `face_values`, checked as `values`."""
-        return _checked_columns("face_values", self.face_values, "triangle", self.triangle_count)
+        return checked_columns("face_values", self.face_values, "triangle", self.triangle_count)
 
     @explains_arguments
     def in_space(self, space: str) -> tuple[NDArray[np.floating], NDArray[np.float32] | None]:

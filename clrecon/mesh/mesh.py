@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from itertools import chain
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import NoSurfaceError, UsageError
-from clrecon.exchange.raw_content import RawMesh, numbers_of, turn_to_lps
+from clrecon.exchange.raw_content import RawMesh, join_numbers, numbers_of, turn_to_lps
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import choose_space
 from clrecon.mesh.base import BaseMesh, give_values
@@ -31,15 +30,6 @@ def _finite_points(points: ArrayLike, name: str, *, one: bool = False) -> NDArra
     if rows.shape[-1:] != (3,) or rows.ndim > (1 if one else 2) or not np.isfinite(rows).all():
         raise UsageError(f"{name} must be three finite numbers{'' if one else ' each'}, these have shape {rows.shape}")
     return rows.reshape(-1, 3)
-
-
-def _joined(parts: list[tuple[dict[str, NDArray[np.floating]], int]]) -> dict[str, NDArray[np.floating]]:
-    """Join numbers by name, of so many vertices or triangles each; NaN where a part has none."""
-    names = dict.fromkeys(chain(*(names for names, _ in parts)))
-    return {
-        name: np.concatenate([own.get(name, np.full(count, np.nan, np.float32)) for own, count in parts])
-        for name in names
-    }
 
 
 class Mesh(BaseMesh, ShownAsHtml):
@@ -162,8 +152,8 @@ class Mesh(BaseMesh, ShownAsHtml):
             np.concatenate(normals) if len(normals) == len(parts) else None,
             facts | ({"voxel_mm": min(steps)} if steps else {}),
         )
-        merged.values = _joined([(part.values, part.vertex_count) for part in parts])
-        merged.face_values = _joined([(part.face_values, part.triangle_count) for part in parts])
+        merged.values = join_numbers([(part.values, part.vertex_count) for part in parts])
+        merged.face_values = join_numbers([(part.face_values, part.triangle_count) for part in parts])
         return merged
 
     @explains_arguments

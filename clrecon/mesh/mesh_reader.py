@@ -41,7 +41,8 @@ def read_mesh(path: str | os.PathLike[str], *, space: Space | None = None) -> Me
         "assumed"), ``unit`` (of the file), ``triangles``, ``parts`` (``name``, ``triangles`` and ``color`` of each
         object, whose triangles follow one another) and ``warnings``.  The name and the colour of a file's only object
         are the mesh's own: ``report["part_name"]``, ``report["color"]``.  Numbers at the vertices and triangles of PLY
-        (``scalar_NAME``) and VTP files are ``values[NAME]`` and ``face_values[NAME]``.
+        (``scalar_NAME``) and VTP files are ``values[NAME]`` and ``face_values[NAME]``; so are those at the vertices of
+        our GLB files, NaN for -1.
 
     Raises
     ------

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from clrecon.errors import UsageError
-from clrecon.exchange.content import PointContent, facts_for_file
+from clrecon.exchange.content import PointContent, checked_columns, facts_for_file
 from clrecon.exchange.coordinates import as_array, as_stored, rows_of_three
 from clrecon.exchange.formats import write_cloud
 from clrecon.exchange.raw_content import turn_to_lps
@@ -93,6 +93,9 @@ class PointCloud(Message, ShownAsHtml):
         self._labels = self._checked("labels", labels)
         self._ijk: NDArray[np.int32] | VoxelNumbers | None = self._checked("ijk", ijk)
         self.report: dict[str, Any] = {} if report is None else report
+        self.values: dict[str, NDArray[np.floating]] = {}
+        """Numbers in mm at the points, (n,) each, by names that end in ``_mm``: on the cortex ``thickness_mm`` and
+        ``error_mm``; written to PLY, VTP and NPZ."""
 
     @classmethod
     def of_known(
@@ -114,6 +117,7 @@ class PointCloud(Message, ShownAsHtml):
         cloud._hu, cloud._labels = hu, labels
         cloud._ijk = ijk
         cloud.report = {} if report is None else report
+        cloud.values = {}
         return cloud
 
     def _checked(self, name: str, values: ArrayLike | None) -> NDArray[Any] | None:
@@ -208,16 +212,22 @@ class PointCloud(Message, ShownAsHtml):
         return array.copy() if copy else array
 
     def changed(self, **arrays: ArrayLike | None) -> PointCloud:
-        """Return a cloud with other `points`, `normals`, `hu`, `labels`, `ijk` or ``report``; all else stays."""
+        """Return a cloud with other `points`, `normals`, `hu`, `labels`, `ijk` or ``report``; all else stays.
+
+        Points at other places have no `values`.
+        """
         known = ("points", "normals", "hu", "labels", "ijk", "report")
         unknown = arrays.keys() - set(known)
         if unknown:
             raise UsageError(f"a cloud has no {sorted(unknown)[0]}: it has {', '.join(known)}")
         if "points" in arrays or "report" in arrays:
             known_arrays = {name: getattr(self, name) for name in known}
-            return PointCloud(**{**known_arrays, "report": dict(self.report), **arrays})
+            moved = PointCloud(**{**known_arrays, "report": dict(self.report), **arrays})
+            moved.values = {} if "points" in arrays else dict(self.values)
+            return moved
         # What stays was checked before.
         cloud = PointCloud.of_known(self._points, self._normals, self._hu, self._labels, self._ijk, dict(self.report))
+        cloud.values = dict(self.values)
         for name, values in arrays.items():
             setattr(cloud, f"_{name}", cloud._checked(name, values))
         return cloud
@@ -251,7 +261,9 @@ class PointCloud(Message, ShownAsHtml):
         points = as_stored(self._points.take(numbers, axis=0))  # those far from the origin may be gone
         of_points = {"normals": self._normals, "hu": self._hu, "labels": self._labels, "ijk": self._ijk}
         arrays = {name: _take_values(values, numbers) for name, values in of_points.items() if values is not None}
-        return PointCloud.of_known(points, **arrays, report=dict(self.report))
+        cloud = PointCloud.of_known(points, **arrays, report=dict(self.report))
+        cloud.values = {name: values[numbers] for name, values in self.values.items()}
+        return cloud
 
     @explains_arguments
     def sample(self, volume: Volume, order: int = 1, outside: float = float("nan")) -> PointCloud:
@@ -282,7 +294,12 @@ class PointCloud(Message, ShownAsHtml):
         points, normals = self.in_space(space)
         facts = facts_for_file(self.report, space, keep_ids=keep_ids)
         ijk = self.ijk if with_ijk else None
-        return PointContent(vertices=points, normals=normals, hu=self._hu, labels=self._labels, ijk=ijk, **facts)
+        values = checked_columns("values", self.values, "point", len(self))
+        if others := [name for name in values if not name.endswith("_mm")]:
+            raise UsageError(f"values of a cloud are in mm and have names that end in _mm, not {others[0]!r}")
+        return PointContent(
+            vertices=points, normals=normals, hu=self._hu, labels=self._labels, ijk=ijk, values=values, **facts
+        )
 
     @explains_arguments
     def save(

@@ -40,10 +40,10 @@ def read_points(path: str | os.PathLike[str], *, space: Space | None = None) -> 
     Returns
     -------
     PointCloud
-        In LPS mm, with the normals, HU and labels that the file has.  Entries of ``report["file"]``: ``kind``,
-        ``space``, ``space_from`` ("file", "argument" or "assumed"), ``points`` and ``warnings``, which name columns and
-        elements that were left out.  ``iso_value_hu``, ``affine_ijk_to_lps_mm`` and ``certificate_lines`` are there
-        where the file has them.
+        In LPS mm, with the normals, HU, labels and ``values`` in mm that the file has.  Entries of ``report["file"]``:
+        ``kind``, ``space``, ``space_from`` ("file", "argument" or "assumed"), ``points`` and ``warnings``, which name
+        columns and elements that were left out.  ``iso_value_hu``, ``affine_ijk_to_lps_mm`` and ``certificate_lines``
+        are there where the file has them.
 
     Raises
     ------
@@ -62,6 +62,7 @@ def read_points(path: str | os.PathLike[str], *, space: Space | None = None) -> 
     points, normals = turn_to_lps(frame, raw.points, raw.normals())
     warnings += _doubt_unit(points)
     arrays = {"normals": normals, "hu": raw.hu(), "labels": raw.labels(), "ijk": raw.ijk()}
+    values = raw.values()
     warnings += raw.unused()
     facts: dict[str, Any] = {
         "kind": raw.kind,
@@ -79,7 +80,9 @@ def read_points(path: str | os.PathLike[str], *, space: Space | None = None) -> 
         report["certificate_lines"] = list(raw.certificate)
     log.info("%s file read: %d points", raw.kind, len(points))
     log_warnings(log, warnings)
-    return PointCloud(points, report=report, **arrays)
+    cloud = PointCloud(points, report=report, **arrays)
+    cloud.values = dict(values)
+    return cloud
 
 
 def _check_points(points: np.ndarray, name: str) -> None:

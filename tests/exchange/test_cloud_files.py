@@ -159,6 +159,43 @@ def test_formats_other_than_xyz_lose_no_field_of_a_cloud(extension):
     assert describe_cloud_losses(make_cloud(3).describe("lps"), extension) == []
 
 
+def cloud_with_walls() -> PointCloud:
+    cloud = make_cloud(4)
+    cloud.values = {"thickness_mm": np.array([0.5, np.nan, 2.0, 3.5], np.float32)}
+    return cloud
+
+
+@pytest.mark.parametrize("extension", [".npz", ".ply", ".vtp"])
+def test_numbers_in_mm_of_a_cloud_are_read_back_with_their_gaps(extension, tmp_path):
+    cloud_with_walls().save(tmp_path / f"walls{extension}")
+    read = read_points(tmp_path / f"walls{extension}")
+    np.testing.assert_array_equal(read.values["thickness_mm"], [0.5, np.nan, 2.0, 3.5])
+    assert read.report["file"]["warnings"] == []
+
+
+@pytest.mark.parametrize("extension", [".las", ".xyz"])
+def test_numbers_in_mm_that_a_format_loses_are_named(extension):
+    (line,) = describe_cloud_losses(cloud_with_walls().describe("lps"), extension)
+    assert "thickness_mm" in line and "NPZ" in line and "LAS have" not in line
+
+
+def test_numbers_in_mm_follow_the_points_that_are_selected():
+    chosen = cloud_with_walls()[[3, 0]].changed(labels=[1, 2])
+    assert chosen.values["thickness_mm"].tolist() == [3.5, 0.5]
+
+
+def test_points_that_are_moved_lose_their_numbers_in_mm():
+    cloud = cloud_with_walls()
+    assert cloud.changed(points=cloud.points + 1.0).values == {}
+
+
+def test_numbers_of_a_cloud_without_a_name_in_mm_are_refused(tmp_path):
+    cloud = make_cloud(2)
+    cloud.values = {"points": np.zeros(2)}
+    with refused(UsageError, "_mm", "points"):
+        cloud.save(tmp_path / "walls.npz")
+
+
 @pytest.fixture
 def cloud_and_npz(tmp_path):
     """A cloud with indices of voxels, and its NPZ file."""

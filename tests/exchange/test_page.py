@@ -17,7 +17,7 @@ from refusals import refused
 from clrecon.errors import UsageError
 from clrecon.exchange import page as pages
 from clrecon.exchange.formats import MOST_PARTS, stage_assembly
-from clrecon.exchange.page import STEPS, decode_surface, encode_surface
+from clrecon.exchange.page import STEPS, decode_surface, decode_values, encode_surface
 from clrecon.mesh import Mesh
 
 pytestmark = pytest.mark.unit
@@ -214,6 +214,34 @@ def test_page_of_more_than_the_most_triangles_is_refused_and_nothing_is_written(
 def test_facts_of_a_page_are_json_with_the_known_keys(page_text):
     facts = json.loads(re.search(r'id="facts" type="application/json">([^<]*)<', page_text)[1])
     assert set(facts) == {"vertices", "triangles", "low", "step", "half_step_mm", "space", "parts", "about"}
+
+
+@pytest.fixture
+def page_of_walls(tmp_path):
+    """A cube whose vertices have thicknesses from 0.5 to 4 mm, one of them none; and HU, which a page does not show."""
+    cube = cubes(1)
+    cube.values = {
+        "thickness_mm": np.linspace(0.5, 4.0, cube.vertex_count, dtype=np.float32),
+        "HU": cube.vertices[:, 0],
+    }
+    cube.values["thickness_mm"][2] = np.nan
+    cube.save(tmp_path / "page.html")
+    return cube, *pages.parse_page((tmp_path / "page.html").read_bytes())
+
+
+def test_numbers_in_mm_come_back_from_a_page_within_half_a_step(page_of_walls):
+    cube, facts, coded = page_of_walls
+    (values,) = decode_values(facts, coded).values()
+    first_uses = list(dict.fromkeys(cube.triangles.reshape(-1).tolist()))
+    expected = cube.values["thickness_mm"][first_uses]
+    half_step = 0.5 * (4.0 - 0.5) / (STEPS - 1)
+    np.testing.assert_allclose(values, expected, rtol=0.0, atol=1.001 * half_step)
+
+
+def test_page_has_a_scale_in_mm_from_0_to_a_round_number(page_of_walls):
+    (column,) = page_of_walls[1]["values"]
+    assert column["name"] == "thickness_mm"
+    assert column["ticks"] == [0.0, 1.25, 2.5, 3.75, 5.0]  # 95 % of the vertices are below 3.8 mm
 
 
 def test_html_without_a_surface_is_refused_as_a_page():

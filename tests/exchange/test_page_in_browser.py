@@ -116,6 +116,36 @@ def test_page_tells_the_iso_value_and_shows_no_message(page):
     assert not page.find_element("id", "message").is_displayed()
 
 
+@pytest.fixture
+def page_of_walls(browser, tmp_path):
+    """A page of a box whose walls are 2 mm thick, on a scale up to 2 mm."""
+    box = Mesh(*samples.box(tuple(BOX_CORNER), BOX_SIZE))
+    box.values = {"thickness_mm": np.full(box.vertex_count, 2.0), "error_mm": np.full(box.vertex_count, np.nan)}
+    box.save(tmp_path / "page.html")
+    open_page(browser, tmp_path / "page.html")
+    return browser
+
+
+def test_page_of_walls_is_painted_in_the_colour_of_their_thickness(page_of_walls):
+    shown = draw_page(page_of_walls)
+    red, green, blue = shown[shown.shape[0] // 2, shown.shape[1] // 2]
+    assert red > 60 and max(green, blue) < 0.5 * red  # the end of the scale is (128, 0, 38)
+
+
+def test_click_on_a_page_of_walls_tells_their_thickness(page_of_walls):
+    click_point(page_of_walls, BOX_CORNER + (10.0, 0.0, 20.0))  # the middle of the face towards the viewer
+    assert page_of_walls.find_element("id", "hint").text.endswith("thickness 2 mm")
+
+
+def test_page_offers_only_numbers_that_are_known(page_of_walls):
+    options = page_of_walls.find_elements("css selector", "#paint option")
+    assert [option.text for option in options] == ["of the parts", "thickness"]
+
+
+def test_page_without_numbers_has_no_choice_of_colours(page):
+    assert not page.find_element("id", "numbers").is_displayed()
+
+
 def test_part_that_is_switched_off_vanishes_from_its_side(page):
     both = draw_page(page)
     _, box_is_shown = page.find_elements("css selector", "#parts input[type=checkbox]")

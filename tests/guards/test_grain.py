@@ -12,8 +12,8 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 98_736,
-    "modules": 432,
+    "lines": 98_876,
+    "modules": 433,
     "small_modules_with_one_reader": 8,
     "docstrings_with_raises": 136,
     "options_in_several_files": 8,

@@ -18,7 +18,7 @@ from PIL import Image
 
 from clrecon.errors import NoSurfaceError
 from clrecon.rendering import Rendering
-from clrecon.rendering.looks.colors import ColorScale
+from clrecon.system.color_scale import ColorScale
 from clrecon.viewer.model.objects import show_objects
 from clrecon.viewer.model.state import Pick
 from clrecon.viewer.session.session import ViewSession

@@ -325,8 +325,9 @@ def extract_points(
     -------
     PointCloud
         Voxels in the order k, j, i, with ``hu`` and ``ijk``; surfaces in the order of the mesh, with ``normals`` and,
-        at one iso value, ``hu``, but those of the cortex, whose report has ``cortex`` as a mesh has it.  Places are
-        exact to the rounding of float32, 1.5e-5 mm within 512 mm of the origin; from 4096 mm on they are float64.
+        at one iso value, ``hu``; those of the cortex have ``values`` and ``report["cortex"]`` as `fit_cortex` gives.
+        Places are exact to the rounding of float32, 1.5e-5 mm within 512 mm of the origin; from 4096 mm on they are
+        float64.
         Entries of ``PointCloud.report``: ``kind``, ``iso_value_hu`` or ``band_hu``, ``voxels`` (of the volume),
         ``points``, and of voxels ``voxels_in_band`` and ``share`` (points of all voxels); ``label``; the affine, the
         certificate, device, ``slabs``, ``device_bytes``, seconds and warnings as in ``Mesh.report``; with ``paper``
@@ -464,7 +465,9 @@ def _surface(
         facts = {name: value for name, value in facts.items() if label is not None or not name.startswith("label")}
         facts["label"] = facts.get("label")
         of_label = np.concatenate([np.full(mesh.vertex_count, number, np.int32) for number, mesh in meshes.items()])
-    points = np.concatenate([mesh.vertices for mesh in meshes.values()])
-    normals = np.concatenate([mesh.normals for mesh in meshes.values() if mesh.normals is not None])
-    hu = None if fitted else np.full(len(points), facts["iso_value_hu"], np.float32)
-    return PointCloud.of_known(points, normals, hu, of_label, None, facts)
+    first, *others = meshes.values()
+    whole = first.merge(*others)
+    hu = None if fitted else np.full(whole.vertex_count, facts["iso_value_hu"], np.float32)
+    cloud = PointCloud.of_known(whole.vertices, whole.normals, hu, of_label, None, facts)
+    cloud.values = whole.values
+    return cloud

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
-from clrecon.rendering.looks.colors import ColorScale, round_up
 from clrecon.rendering.looks.lighting import Lighting
 from clrecon.rendering.looks.window import checked_window
 from clrecon.rendering.pictures import style_checks as checks
@@ -19,6 +18,7 @@ from clrecon.rendering.pictures.styles import Color, Lit, Style, style_field
 from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.reformation import positive_mm
 from clrecon.system.arguments import WindowName, name_parameter
+from clrecon.system.color_scale import ColorScale
 from clrecon.system.light_dataclass import dataclass
 
 
@@ -38,8 +38,6 @@ def _vertex_colors(value: Any) -> NDArray[np.uint8]:
 
 MESH_COLORS = {"thickness": "mm thick", "error": "mm of error", "distance": "mm away"}
 """Numbers at vertices that colours show, ``thickness_mm`` and so on, with the title of their scale."""
-
-_LEAST_LIMIT_MM = 1e-3
 
 
 @dataclass(frozen=True)
@@ -89,12 +87,13 @@ class MeshLook(Style, Lit):
     def find_scale(self, values: Mapping[str, NDArray[np.floating]]) -> tuple[ColorScale, NDArray[np.floating]]:
         """Return the scale of ``color_by`` for a mesh with these numbers at its vertices, and those that it shows."""
         name = f"{self.color_by}_mm"
-        known = np.abs(values[name][np.isfinite(values[name])]) if name in values else np.zeros(0)
-        if not len(known):
-            whose = "coloured by distance (PLY)" if self.color_by == "distance" else "fitted to the cortex (PLY, VTP)"
+        scale = ColorScale.spanning(values[name]) if name in values else None
+        if scale is None:
+            whose = (
+                "coloured by distance (PLY)" if self.color_by == "distance" else "fitted to the cortex (PLY, VTP, GLB)"
+            )
             raise UsageError(f"the mesh has no {name} at its vertices: one {whose} has them")
-        limit = round_up(max(float(np.percentile(known, 95.0)), _LEAST_LIMIT_MM))
-        return ColorScale(limit, bool((values[name] < 0.0).any())), values[name]
+        return scale, values[name]
 
     def colors_at(self, values: Mapping[str, NDArray[np.floating]]) -> NDArray[np.uint8] | None:
         """Return the colours of a mesh's vertices with these numbers; None where all have one colour."""

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
-from clrecon.rendering.looks.colors import ColorScale
 from clrecon.rendering.looks.window import BONE_WINDOW, grey_image
 from clrecon.rendering.pictures.annotations import PictureData
 from clrecon.rendering.pictures.picture import Rendering
 from clrecon.rendering.pictures.pillow import load_font, load_pillow
+from clrecon.system.color_scale import ColorScale
 from clrecon.system.light_dataclass import dataclass, field, replace
 
 SHEET_SIZE = (1600, 1200)

@@ -26,10 +26,10 @@ from clrecon.operators.resident.device_volume import DeviceVolume, DeviceWorker
 from clrecon.operators.surface.cortex_mesh import fit_cortex
 from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurface
 from clrecon.rendering import Rendering
-from clrecon.rendering.looks.colors import ColorScale
 from clrecon.rendering.pictures.object_looks import MeshLook
 from clrecon.rendering.pictures.styles import PlaneCut, Style, SurfaceLook, VolumeLook
 from clrecon.rendering.views.camera import Camera
+from clrecon.system.color_scale import ColorScale
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import format_hu

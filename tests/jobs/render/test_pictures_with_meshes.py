@@ -18,8 +18,8 @@ from clrecon.cli.main import main
 from clrecon.errors import UsageError
 from clrecon.jobs.render.job import PictureFiles, make_pictures
 from clrecon.jobs.render.settings import MeshFile, RenderSettings
-from clrecon.rendering.looks.colors import ColorScale
 from clrecon.rendering.looks.lighting import UNSHADED
+from clrecon.system.color_scale import ColorScale
 
 
 @pytest.fixture

@@ -436,6 +436,14 @@ def test_points_of_the_cortex_have_no_hu_and_report_how_many_are_fitted(device, 
     assert cloud.report["cortex"]["fitted"] > 0.9 * outer_points(cloud).sum()  # measured all
 
 
+def test_points_of_the_cortex_have_thickness_and_error_of_the_fitted_mesh(device, hollow_bone):
+    cloud = extract_points(hollow_bone, 200.0, kind="cortex", device=device)
+    mesh = fit_cortex(extract_isosurface(hollow_bone, 200.0, device=device), hollow_bone, device=device)
+    assert set(cloud.values) == {"thickness_mm", "error_mm"}
+    for name, values in cloud.values.items():
+        assert np.array_equal(values, mesh.values[name], equal_nan=True)
+
+
 def test_points_of_the_cortex_of_labels_are_those_of_their_fitted_meshes(device, hollow_bone):
     """A label for the lower half, and one for the upper."""
     numbers = np.ones(hollow_bone.voxels.shape, np.uint8)

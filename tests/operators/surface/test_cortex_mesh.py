@@ -230,6 +230,21 @@ def test_glb_of_a_fitted_surface_holds_minus_one_for_values_of_nan(fitted, tmp_p
     assert np.array_equal(found[3:], fitted.values["error_mm"][3:])
 
 
+def test_values_of_a_fitted_surface_are_read_back_from_glb(fitted, tmp_path):
+    fitted.values["error_mm"][:3] = np.nan
+    fitted.save(tmp_path / "a.glb")
+    read = clrecon.read_mesh(tmp_path / "a.glb")
+    for name in ("thickness_mm", "error_mm"):
+        assert np.array_equal(read.values[name], fitted.values[name], equal_nan=True)
+
+
+def test_glb_keeps_minus_one_among_other_negative_numbers(fitted, tmp_path):
+    fitted.values["away_mm"] = np.resize(np.array([-1.0, -2.0, 3.0], np.float32), fitted.vertex_count)
+    fitted.save(tmp_path / "a.glb")
+    del fitted.values["away_mm"]
+    assert clrecon.read_mesh(tmp_path / "a.glb").values["away_mm"][:3].tolist() == [-1.0, -2.0, 3.0]
+
+
 def test_glb_of_a_fitted_surface_holds_its_vertices(fitted, tmp_path):
     fitted.save(tmp_path / "a.glb")
     assert np.allclose(clrecon.read_mesh(tmp_path / "a.glb").vertices, fitted.vertices, atol=1e-4)  # metres in float32

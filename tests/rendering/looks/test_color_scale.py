@@ -8,8 +8,8 @@ from refusals import refused
 
 from clrecon.errors import UsageError
 from clrecon.rendering import Rendering
-from clrecon.rendering.looks.colors import ColorScale, round_up
 from clrecon.rendering.pictures.sheets import add_scale
+from clrecon.system.color_scale import ColorScale, round_up
 
 
 def test_colours_of_signed_values_are_blue_below_zero_grey_at_it_and_red_above() -> None:
