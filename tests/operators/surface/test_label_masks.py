@@ -213,7 +213,7 @@ def test_volume_of_a_mask_is_kept_ten_times_better_than_by_surface_nets_near_the
     points, triangles = surface_nets(labels)
     share_of_nets = 1000.0 * abs(enclosed_ml(points, triangles)) / np.count_nonzero(labels) - 1.0
 
-    mesh = extract_label_masks(LabelMap(labels, np.eye(4)), device=device)[1]
+    (mesh,) = extract_label_masks(LabelMap(labels, np.eye(4)), device=device).values()
 
     assert abs(volume_share(mesh)) < 0.1 * abs(share_of_nets)  # measured 3e-4 of it
     to_nets, _ = cKDTree(points).query(mesh.vertices)
@@ -224,7 +224,7 @@ def test_surface_of_the_mask_of_a_tilted_plane_has_its_normal_without_steps(devi
     k, j, i = np.indices((24, 40, 40))
     slope_i, slope_j = 0.2, 0.37
     labels = (k - 12 <= slope_i * (i - 20) + slope_j * (j - 20)).astype(np.uint8)
-    mesh = extract_label_masks(LabelMap(labels, np.eye(4)), device=device)[1]
+    (mesh,) = extract_label_masks(LabelMap(labels, np.eye(4)), device=device).values()
     far_from_ends = (np.abs(mesh.vertices[:, :2] - 20) < 12).all(axis=1) & (np.abs(mesh.vertices[:, 2] - 12) < 9)
     normal = np.array([-slope_i, -slope_j, 1.0]) / np.linalg.norm([slope_i, slope_j, 1.0])
     angles = np.degrees(np.arccos(np.clip(mesh.normals[far_from_ends] @ normal, -1, 1)))
@@ -237,7 +237,7 @@ def test_surface_of_the_mask_of_a_tilted_plane_has_its_normal_without_steps(devi
 def test_a_hollow_mask_keeps_its_volume_on_any_grid(device, affine):
     labels = ball_mask((17, 24, 26), 7.3).astype(np.uint8)
     labels[ball_mask((17, 24, 26), 3.0)] = 2
-    mesh = extract_label_masks(LabelMap(labels, affine), device=device, label=[1])[1]
+    (mesh,) = extract_label_masks(LabelMap(labels, affine), device=device, label=[1]).values()
     assert abs(volume_share(mesh)) <= tolerances.MASK_VOLUME
     assert_sound(mesh)
 
@@ -261,7 +261,7 @@ def test_thin_parts_and_single_voxels_are_one_sound_body_of_their_volume(device,
 
 
 def test_surface_of_a_label_that_fills_the_map_ends_half_a_voxel_beyond_it(device):
-    mesh = extract_label_masks(LabelMap(np.ones((4, 5, 6), np.uint8), np.eye(4)), device=device)[1]
+    (mesh,) = extract_label_masks(LabelMap(np.ones((4, 5, 6), np.uint8), np.eye(4)), device=device).values()
     assert_sound(mesh)
     assert mesh.vertices.min(axis=0).tolist() == [-0.5] * 3
     assert mesh.vertices.max(axis=0).tolist() == [5.5, 4.5, 3.5]

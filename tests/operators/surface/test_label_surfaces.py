@@ -26,14 +26,14 @@ from clrecon.proof.surface import labels as twin
 SHAPES = [(5, 7, 9), (6, 5, 31), (5, 6, 33), (9, 4, 64), (4, 5, 100), (3, 4, 1030)]
 
 
-def assert_equals_twin(mesh, volume, inside, number, iso_value, closed=True):
+def assert_equals_twin(mesh, volume, inside, *, number, iso_value, closed=True):
     vertices, normals, triangles = twin.extract_label(volume, inside, number, iso_value, closed=closed)
     assert np.array_equal(mesh.triangles, triangles)
     assert np.abs(volume.lps_to_ijk(mesh.vertices) - volume.lps_to_ijk(vertices)).max() <= tolerances.TWIN_VERTEX_VOXEL
     assert np.abs(mesh.normals - normals).max() <= tolerances.TWIN_NORMAL
 
 
-def share_placed_by_hu(volume, inside, number, iso_value, vertices) -> float:
+def share_placed_by_hu(volume, inside, *, number, iso_value, vertices) -> float:
     """The share of crossed edges of a closed label that HU place; others carry their vertex half way."""
     inside = np.pad(inside, 1)
     dense = np.pad(volume.voxels >= iso_value, 1)
@@ -58,9 +58,9 @@ def test_surfaces_of_labels_and_their_share_placed_by_hu_equal_the_twin(device, 
     )
     assert tuple(meshes) == numbers
     for number, mesh in meshes.items():
-        assert_equals_twin(mesh, volume, inside, number, 3, closed=closed)
+        assert_equals_twin(mesh, volume, inside, number=number, iso_value=3, closed=closed)
         if closed:
-            by_hu = share_placed_by_hu(volume, inside, number, 3, len(mesh.vertices))
+            by_hu = share_placed_by_hu(volume, inside, number=number, iso_value=3, vertices=len(mesh.vertices))
             assert mesh.report["vertices_by_hu_share"] == pytest.approx(by_hu, abs=tolerances.FLOAT64_SHARE)
 
 
@@ -73,7 +73,7 @@ def test_surfaces_of_labels_equal_their_twin_for_every_voxel_type(device, dtype,
     meshes = extract_labels(volume, LabelMap(labels, MIRRORED), iso_value, device=device)
     assert tuple(meshes) == (3, 7, 300)
     for number, mesh in meshes.items():
-        assert_equals_twin(mesh, volume, inside, number, iso_value)
+        assert_equals_twin(mesh, volume, inside, number=number, iso_value=iso_value)
 
 
 @pytest.mark.release
@@ -86,7 +86,7 @@ def test_every_variant_of_the_kernels_gives_the_same_meshes(device, lanes, words
     monkeypatch.setattr(device, "kernel_variants", variants)
     label_map = LabelMap(labels.astype(np.uint8 if max(numbers) < 256 else np.uint16), MIRRORED)
     for number, mesh in extract_labels(volume, label_map, 3, device=device).items():
-        assert_equals_twin(mesh, volume, inside, number, 3)
+        assert_equals_twin(mesh, volume, inside, number=number, iso_value=3)
 
 
 @pytest.mark.every_device
@@ -119,7 +119,8 @@ def random_label_meshes(device):
 def test_surface_of_a_label_is_closed_and_manifold_with_no_vertex_twice(random_label_meshes, number):
     _, _, meshes = random_label_meshes
     quality = meshes[number].quality()
-    assert quality["closed"] and quality["manifold"] and quality["volume_ml"] > 0
+    assert (quality["closed"], quality["manifold"]) == (True, True)
+    assert quality["volume_ml"] > 0
     assert (quality["zero_area_faces"], quality["unused_vertices"]) == (0, 0)
     assert len(np.unique(meshes[number].vertices, axis=0)) == len(meshes[number].vertices)
 
@@ -342,7 +343,7 @@ def test_triangles_of_a_label_of_a_small_volume_equal_the_twin(device, number):
     volume, labels = random_volume((4, 4, 33)), random_labels((4, 4, 33))
     inside = twin.find_solid(volume, labels, 3, grow_mm=1.2)
     mesh = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device=device, grow_mm=1.2)[number]
-    _, _, triangles = twin.extract_label(volume, inside, number, 3)
+    _, _, triangles = twin.extract_label(volume, inside, number, iso_value=3)
     assert np.array_equal(mesh.triangles, triangles)
 
 
@@ -353,7 +354,7 @@ def test_triangles_of_a_label_without_growth_between_other_slices_equal_the_twin
     labels[4:6] = 3
     inside = twin.find_solid(volume, labels, 3, grow_mm=0)
     mesh = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device=device, grow_mm=0)[3]
-    _, _, triangles = twin.extract_label(volume, inside, 3, 3)
+    _, _, triangles = twin.extract_label(volume, inside, number=3, iso_value=3)
     assert np.array_equal(mesh.triangles, triangles)
 
 
@@ -379,8 +380,8 @@ def real_vertebrae(device, real_data):
 @pytest.mark.parametrize("number", [T12, T11], ids=["T12", "T11"])
 def test_hollow_and_solid_surfaces_of_a_real_vertebra_are_closed_and_manifold(real_vertebrae, number):
     hollow, solid, _ = real_vertebrae
-    for mesh in (hollow[number], solid[number]):
-        assert mesh.quality()["closed"] and mesh.quality()["manifold"]
+    for quality in (hollow[number].quality(), solid[number].quality()):
+        assert (quality["closed"], quality["manifold"]) == (True, True)
 
 
 @pytest.mark.release
@@ -414,5 +415,5 @@ def test_a_volume_that_is_held_is_used_whole_where_a_mesh_of_half_the_bytes_fits
         rule, growth = choose_iso_rule(volume, 3), Growth.of(volume, 1.0)
         taken = resample_labels(LabelMap(labels, np.eye(4)), volume)
         run = operator.LabelExtraction(resident, taken, rule, growth, solid=False, warnings=[])
-        assert sum(run.needs(0, 40).values()) == 4 * volume.voxels.size
+        assert sum(run.needs(first=0, end=40).values()) == 4 * volume.voxels.size
         assert run.slices_for({1: (slice(20, 22), slice(1, 4), slice(2, 6))}) == slices

@@ -117,7 +117,7 @@ def test_scatter_of_a_surface_is_that_of_its_vertex_rule_at_any_level(measures: 
     linear, golden = measures[level, "linear"], measures[level, "golden"]
     assert linear.scatter_mm < 0.03  # mm; measured up to 0.009
     assert golden.scatter_mm > 0.15  # mm; measured from 0.21 on
-    assert linear.normals_median_deg < golden.normals_median_deg / 2
+    assert linear.normals_median_deg < golden.normals_median_deg / 2  # measured 0.9 to 2 and 21 degrees
 
 
 @pytest.mark.parametrize("level", [0, -100])
@@ -146,6 +146,6 @@ def test_surfaces_of_a_real_scan_have_the_dice_of_the_documents(
     )
     slices = measure_slices(mesh, volume, 200)
     assert slices.dice == pytest.approx(fine_dice, abs=0.0016)  # written with three decimals
-    assert measure_cells(mesh, linear, volume).dice == pytest.approx(cells_dice, abs=0.002)
+    assert measure_cells(mesh, linear, volume).dice == pytest.approx(cells_dice, abs=0.0016)
     if method == "t-mc":
         assert slices.voxel_dice == 1.0

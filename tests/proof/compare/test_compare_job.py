@@ -126,15 +126,15 @@ def test_methods_of_a_comparison_have_the_figures_that_follow_from_their_algorit
     assert rows["t-mc-soup"]["surfaces"]["max_mm"] < 1e-4  # float32
     assert rows["t-mc"]["cells"]["dice"] == rows["vtk-mc"]["cells"]["dice"] == 1.0
     assert rows["i-mc"]["cells_visited"] < rows["i-mc"]["cells_all"] == rows["t-mc"]["cells_visited"]
-    assert rows["i-mc-golden"]["slices"]["dice"] < rows["i-mc"]["slices"]["dice"] - 0.01
+    assert rows["i-mc-golden"]["slices"]["dice"] < rows["i-mc"]["slices"]["dice"] - 0.01  # measured 0.015 less
 
 
 @pytest.mark.release
 @pytest.mark.long
 def test_triangle_soup_of_a_surface_has_the_picture_of_the_surface(device: Any, comparison: Path) -> None:
     [soup] = [m for m in read_report(comparison)["methods"] if m["name"] == "t-mc-soup"]
-    assert soup["pictures"]["mse"] < 1e-3
-    assert soup["pictures"]["ssim"] > 0.9999
+    assert soup["pictures"]["mse"] < 2e-5  # measured 4e-6
+    assert soup["pictures"]["ssim"] > 0.999999  # measured 8e-8 less than 1
 
 
 @pytest.mark.release

@@ -70,7 +70,7 @@ def test_cut_of_a_ball_is_one_closed_circle(device: Any) -> None:
     np.testing.assert_allclose(radius, np.sqrt(RADIUS**2 - 4.0**2), atol=0.05)  # voxels
     ends, many = np.unique(np.round(lines.reshape(-1, 2), 3), axis=0, return_counts=True)
     assert (many == 2).all()  # one closed line
-    assert len(ends) == len(lines) > 50
+    assert len(ends) == len(lines) > 50  # measured 146
 
 
 def test_planes_of_a_comparison_go_through_the_middle_of_the_object() -> None:
@@ -96,8 +96,8 @@ def test_peers_lie_where_the_scan_is_and_face_outward(name: str, affine: Any, de
     peer, own = extract_by_vtk(volume, 200, name, closed=True), surface_of(volume, device)
     assert peer.triangle_count == own.triangle_count
     quality = peer.quality()
-    assert quality.closed and quality.outward
-    assert quality.volume_ml == pytest.approx(own.quality().volume_ml, rel=2e-4)
+    assert (quality.closed, quality.outward) == (True, True)
+    assert quality.volume_ml == pytest.approx(own.quality().volume_ml, rel=1e-5)  # float32; measured 2.4e-6
     assert clrecon.compare_meshes(peer, own).hd95_mm < 0.05  # measured 0.0014
     cells = (32 + 1) * (30 + 1) * (28 + 1)  # of the voxels and a border
     assert peer.report["cells"] == {"visited": cells, "all": cells}
@@ -196,7 +196,7 @@ def test_half_of_a_mesh_is_measured_as_open_and_incomplete(judge: Judge) -> None
 
 def test_cloud_is_measured_by_its_distance_from_the_reference(judge: Judge) -> None:
     cloud = judge.measure("cloud")
-    assert cloud["points"]["to_reference_mm"]["max"] == pytest.approx(50.0, abs=1.0)
+    assert cloud["points"]["to_reference_mm"]["max"] == pytest.approx(50.0, abs=1e-4)  # float32; measured 8e-6
     assert (cloud["points"]["bias_mm"], cloud["slices"]) == (None, None)
 
 

@@ -77,7 +77,7 @@ def test_wall_of_a_cavity_is_not_measured_as_outer_surface():
     vertices, triangles = samples.join((outer.vertices, outer.triangles), (inner.vertices, inner.triangles[:, ::-1]))
     found = measure_truth(Mesh(vertices, triangles), Ball())
     assert found.bias_mm == pytest.approx(0.2, abs=tolerances.BALL_SAGITTA_MM)
-    assert found.outer_share == pytest.approx(10.2**2 / (10.2**2 + 9.2**2), abs=1e-3)
+    assert found.outer_share == pytest.approx(10.2**2 / (10.2**2 + 9.2**2), abs=1e-3)  # areas
 
 
 def test_mesh_beyond_the_reach_of_its_truth_is_left_out():
@@ -109,7 +109,7 @@ def test_flat_cut_at_the_border_of_the_scan_is_left_out_of_the_measures():
     assert found.bias_mm == pytest.approx(0.2, abs=tolerances.BALL_SAGITTA_MM)
     assert found.scatter_mm < tolerances.BALL_SAGITTA_MM
     assert found.reach_mm == 2.0  # of the longest step
-    assert measure_truth(cut, truth).scatter_mm > 10 * found.scatter_mm
+    assert measure_truth(cut, truth).scatter_mm > 10 * found.scatter_mm  # measured 0.29 and 0.0017 mm
 
 
 def test_truth_without_a_distance_is_refused_by_its_type():
@@ -168,7 +168,7 @@ def test_cells_of_a_fine_mesh_of_a_ball_are_those_cut_by_the_ball():
     found = measure_cells(mesh, find_cut_cells(truth, grid), grid)
     assert found.reference == "truth"
     assert found.recall > 0.99  # corners between the 27 points of a cell
-    assert found.precision > 0.97
+    assert found.precision > 0.99  # measured 0.9989
     assert measure_cells(mesh, find_mesh_cells(mesh, grid, name="t-mc"), grid).dice == 1.0
 
 

@@ -86,7 +86,7 @@ def test_share_of_a_voxel_below_a_level_plane_is_exact(height: float) -> None:
     gap = 2.5  # between slices, mm; the first reaches from -1.25 to 1.25
     affine = np.diag((0.5, 0.7, gap, 1.0))
     share = sample_occupancy(HalfSpace((0.0, 0.0, height), (0.0, 0.0, 1.0)), affine, (3, 4, 5))
-    assert share[0] == pytest.approx(0.5 + height / gap, abs=1e-6)
+    assert share[0] == pytest.approx(0.5 + height / gap, abs=1e-6)  # float32
     assert share[2].max() == 0.0
 
 

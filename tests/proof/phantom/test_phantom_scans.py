@@ -83,8 +83,8 @@ def test_scan_of_a_scanner_that_pads_has_its_padding_outside_of_the_disc_alone(
     padding = KINDS[kind].scanner.padding
     outside = outside_disc(voxels.shape[1:], affine) & (padding is not None)
     assert (voxels[:, outside] == padding).all()
-    corners = 1.0 - np.pi / 4.0  # of a square around a disc
-    assert outside.mean() == pytest.approx(0.0 if padding is None else corners, abs=0.04)
+    corners = 1.0 - np.pi / 4.0 * 0.985**2  # of a square around a disc that ends a little within it
+    assert outside.mean() == pytest.approx(0.0 if padding is None else corners, abs=0.005)  # pixels at the rim
 
 
 def test_volume_of_bone_in_the_truth_is_its_number_of_voxels_times_their_size(
@@ -104,7 +104,7 @@ def test_cupping_falls_with_the_square_of_the_distance_from_the_centre(rows_up: 
 
     share_of_radius = max(rows_up, columns_right) / 20.5  # half the shorter side
     found = field[:, 20 - rows_up, 30 + columns_right]
-    assert found == pytest.approx(-100.0 * (1.0 - share_of_radius**2), abs=1e-3)
+    assert found == pytest.approx(-100.0 * (1.0 - share_of_radius**2), abs=1e-3)  # HU in float32
 
 
 def test_cupping_changes_nothing_outside_of_the_disc_of_the_field() -> None:

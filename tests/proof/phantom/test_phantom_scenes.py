@@ -76,12 +76,14 @@ def test_median_of_air_in_a_scene_is_minus_1000_hu_in_the_unit_of_its_scanner(
 
 def test_metal_has_the_largest_value_of_12_bits() -> None:
     settings = coarse_settings("pelvis", **CLEAN)
-    metal = make_phantom(settings)[0][label_materials(settings) == MATERIALS.index("metal")]
+    voxels, _, _ = make_phantom(settings)
+    metal = voxels[label_materials(settings) == MATERIALS.index("metal")]
     assert np.median(metal) == metal.max() == 2**12 - 1 - 1024
 
 
 def test_dry_skull_is_the_bone_of_a_head_without_its_soft_tissue() -> None:
-    skull, head = (make_phantom(coarse_settings(kind))[2]["parts"] for kind in ("skull", "head"))
+    (_, _, truth_of_skull), (_, _, truth_of_head) = (make_phantom(coarse_settings(kind)) for kind in ("skull", "head"))
+    skull, head = truth_of_skull["parts"], truth_of_head["parts"]
     assert skull["bone"]["voxels"] == head["bone"]["voxels"]
     assert "tissue" not in skull
     assert head["tissue"]["volume_ml"] > 1500.0  # a head has some 4000 ml
@@ -179,7 +181,7 @@ def test_scene_is_written_over_an_earlier_one_with_the_same_bytes(
 
 
 def test_truth_of_a_scene_names_the_settings_that_were_chosen_and_no_default() -> None:
-    truth = make_phantom(coarse_settings("limb", table="curved", table_gap_mm=5.0))[2]
+    _, _, truth = make_phantom(coarse_settings("limb", table="curved", table_gap_mm=5.0))
     assert truth["settings"]["table_gap_mm"] == 5.0
     assert "prone" not in truth["settings"]
 

@@ -17,6 +17,7 @@ from variants import daily
 from clrecon.errors import OutputError, UsageError
 from clrecon.proof.phantom import PhantomSettings, build, make_phantom, write_phantom
 
+FLOAT64 = 1e-9
 AWKWARD = {"size": (38, 30), "slices": 14, "spacing": (0.7, 0.5, 2.5)}
 
 
@@ -77,8 +78,8 @@ def test_written_series_has_the_size_spacing_and_tilt_of_its_settings(
     )
     along_column, along_row, gap = AWKWARD["spacing"]
     assert [np.linalg.norm(row), np.linalg.norm(column)] == pytest.approx([along_row, along_column])
-    assert step @ normal / np.linalg.norm(normal) == pytest.approx(gap, abs=1e-9)
-    assert written_phantom.truth["tilt_deg"] == pytest.approx(extra.get("tilt", 0.0), abs=1e-6)
+    assert step @ normal / np.linalg.norm(normal) == pytest.approx(gap, abs=FLOAT64)
+    assert written_phantom.truth["tilt_deg"] == pytest.approx(extra.get("tilt", 0.0), abs=FLOAT64)
 
 
 def test_headers_of_a_phantom_are_those_of_a_ct(written_phantom: SimpleNamespace, extra: dict) -> None:
@@ -105,9 +106,6 @@ def test_decimal_strings_of_a_written_series_have_at_most_16_characters(tmp_path
         for name in ("ImagePositionPatient", "ImageOrientationPatient", "PixelSpacing"):
             texts = header.get_item(name).value.decode().split("\\")
             assert all(0 < len(text.strip()) <= 16 for text in texts), texts
-
-
-FLOAT64 = 1e-9
 
 
 def affine_of(**extra: object) -> np.ndarray:

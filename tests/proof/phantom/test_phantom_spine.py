@@ -56,14 +56,14 @@ def test_one_to_six_percent_of_the_voxels_of_a_spine_are_bone_some_above_1000_hu
     voxels, _, _ = spine
     assert 0.01 < (voxels > 226).mean() < 0.06  # HU of the default preset of bone
     assert (voxels > 500).sum() > 5000  # of 1.9 million: cortex
-    assert voxels.max() > 1000
+    assert voxels.max() > 1000  # measured 2213: the marker
 
 
 @pytest.mark.release
 def test_air_of_a_spine_has_noise_of_less_than_40_hu(spine: tuple) -> None:
     voxels, _, _ = spine
     air = voxels[0, :3, :3]  # the corner of a slice
-    assert air.std() < 40.0
+    assert air.std() < 40.0  # measured 16
     assert voxels.min() > -1100  # air has -1000; measured -1056
 
 
@@ -114,7 +114,7 @@ def test_left_marker_lies_on_the_left_alone(spine: tuple) -> None:
 
     assert truth["spine"]["left_marker_inside"]
     assert marker[0] > centre_of_t12(spine)[0] + 50.0  # x grows to the left
-    assert values_at(spine, marker[None])[0] > 1200
+    assert values_at(spine, marker[None])[0] > 1200  # measured 2181
     assert values_at(spine, mirrored[None])[0] < 200  # neither metal nor bone; measured -112, as fat has
 
 
@@ -209,4 +209,4 @@ def test_spine_has_all_ribs_but_the_left_twelfth(whole_spine: Anatomy) -> None:
 def test_levels_of_a_straight_spine_lie_near_the_middle_plane(whole_spine: Anatomy) -> None:
     x = np.array([vertebra.center[0] for vertebra in whole_spine.vertebrae])
     middle_x = 1.7  # mm, of the planned spine
-    assert np.abs(x - middle_x).max() < 25.0
+    assert np.abs(x - middle_x).max() < 3.0  # mm; measured 1.4

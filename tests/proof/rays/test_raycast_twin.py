@@ -267,7 +267,7 @@ def test_hash_of_a_pixel_is_lowbias32_of_its_column_and_the_hash_of_its_row():
 
 
 def test_jitter_is_spread_evenly_from_0_to_1_in_float32():
-    jitter = jitter_pixels(256, 256)
+    jitter = jitter_pixels(width=256, height=256)
     # the lowest of 65,536 even numbers lies near 1.5e-5, the highest as far below 1
     assert 0.0 <= jitter.min() < 1e-3
     assert 0.999 < jitter.max() < 1.0
@@ -278,13 +278,13 @@ def test_jitter_is_spread_evenly_from_0_to_1_in_float32():
 
 @pytest.mark.parametrize("shift", [(0, 1), (1, 0), (1, 1), (0, 2), (16, 0)])
 def test_jitter_of_a_pixel_is_uncorrelated_with_that_of_a_neighbour(shift):
-    centred = jitter_pixels(256, 256) - 0.5
+    centred = jitter_pixels(width=256, height=256) - 0.5
     four_standard_errors = 4.0 / 12.0 / 256.0  # of the mean product
     assert abs((centred * np.roll(centred, shift, (0, 1))).mean()) < four_standard_errors
 
 
 def test_jitter_of_a_pixel_does_not_depend_on_the_size_of_the_picture():
-    assert np.array_equal(jitter_pixels(256, 256)[:50, :60], jitter_pixels(60, 50))
+    assert np.array_equal(jitter_pixels(width=256, height=256)[:50, :60], jitter_pixels(width=60, height=50))
 
 
 def test_jitter_lies_within_each_segment_the_last_one_too():
@@ -292,7 +292,7 @@ def test_jitter_lies_within_each_segment_the_last_one_too():
     volume = even_volume(lambda p: p[:, 1], "even", extent=20.0)
     camera = look(volume, (0.0, 1.0, 0.0), 4.0)
     thin = TransferFunction([(-12, 1, 1, 1, 0.0), (12, 1, 1, 1, 0.001)])
-    step, part = 1.7, jitter_pixels(8, 8)
+    step, part = 1.7, jitter_pixels(width=8, height=8)
     opacity = cast_rays(volume, VolumeLook(thin, jitter=True, ray_step=step), camera, (8, 8)).rgba[..., 3]
     voxel_mm = 0.9  # of an even volume
     depth, inner = voxel_mm * volume.shape_ijk[1], 0.5 * voxel_mm * (volume.shape_ijk[1] - 1)

@@ -164,5 +164,5 @@ def test_every_case_encloses_the_volume_that_it_has_in_vtk():
         contour = image.contour([0.5], method="flying_edges", compute_normals=False, compute_scalars=False)
         enclosed = np.linalg.det(contour.points.astype(np.float64)[contour.regular_faces]).sum() / 6
         triangles = MIDDLES[np.array(case_table()[case], dtype=int).reshape(-1, 3)]
-        assert np.linalg.det(triangles).sum() / 6 == pytest.approx(enclosed, abs=1e-6), case
+        assert np.linalg.det(triangles).sum() / 6 == pytest.approx(enclosed, abs=1e-6), case  # float32
         assert len(triangles) == contour.n_cells, case

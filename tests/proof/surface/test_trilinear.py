@@ -338,8 +338,9 @@ def test_surfaces_with_saddles_or_samples_at_the_iso_value_are_closed_and_manifo
                 Volume(voxels, np.eye(4)), iso_value, topology="trilinear"
             )
             quality = Mesh(vertices, triangles, normals).quality()
-            assert quality["closed"] and quality["manifold"] and quality["volume_ml"] > 0
-            assert quality["zero_area_faces"] == 0 and quality["unused_vertices"] == 0
+            assert (quality["closed"], quality["manifold"]) == (True, True)
+            assert quality["volume_ml"] > 0
+            assert (quality["zero_area_faces"], quality["unused_vertices"]) == (0, 0)
 
 
 def test_ambiguous_faces_of_masks_separate_their_inside_corners():

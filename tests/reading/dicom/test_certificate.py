@@ -108,7 +108,7 @@ def test_certificate_of_an_oblique_tilted_series_has_its_geometry(oblique_tilted
 def test_certificate_of_an_oblique_series_has_its_directions(oblique_tilted):
     plan, report = oblique_tilted
     orientation, (row, column, normal) = report["orientation"], plan.directions
-    assert orientation["row"] == pytest.approx(list(row), abs=1e-8)
+    assert orientation["row"] == pytest.approx(list(row), abs=1e-8)  # written with nine decimals
     assert orientation["column"] == pytest.approx(list(column), abs=1e-8)
     assert orientation["normal"] == pytest.approx(list(normal), abs=1e-8)
     assert orientation["off_axis_deg"] == pytest.approx(np.degrees(np.arccos(normal[2])))

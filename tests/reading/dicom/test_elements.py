@@ -81,7 +81,7 @@ def test_files_of_pydicom_are_parsed_alike_by_both_parsers_and_most_by_the_plain
     files = corpus()
     taken = [name for name, data in files.items() if assert_parsed_alike(data, len(data))]
     assert len(files) > 120  # measured 163: another version of pydicom may have fewer
-    assert len(taken) > len(files) // 2
+    assert len(taken) > len(files) // 2  # measured 85
     assert {"CT_small.dcm", "MR_small.dcm", "MR_small_implicit.dcm", "J2K_pixelrep_mismatch.dcm"} <= set(taken)
 
 
