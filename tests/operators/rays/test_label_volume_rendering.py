@@ -33,7 +33,7 @@ def labelled_block() -> tuple[Volume, LabelMap]:
 
 def camera_along_j(volume: Volume) -> Camera:
     """One pixel a voxel of i, in pictures of 20 x 4."""
-    middle = volume.ijk_to_lps([(9.5, 4.5, 20.5)])[0]
+    (middle,) = volume.ijk_to_lps([(9.5, 4.5, 20.5)])
     return Camera(middle - (0, 50, 0), middle, (0, 0, 1), parallel_scale=2 * SPACING[0])
 
 
@@ -41,13 +41,13 @@ def camera_along_j(volume: Volume) -> Camera:
 def row_of_labels(request, device):
     """A row of the picture of the block: label 1 with a quarter of its opacity, label 3 red with a half."""
     volume, labels = labelled_block()
-    made = render(
+    picture = render(
         volume, transfer_function=GREY, camera=camera_along_j(volume), size=(20, 4), ray_step=0.3, device=device,
         memory=request.param, lighting=UNSHADED, background="transparent", labels=labels,
         label_colors={3: "red"}, label_opacity={1: 0.25, 3: 0.5},
     )  # fmt: skip
-    assert (made.report["slabs"] > 1) == (request.param is not None)
-    return made.image[2].astype(float)
+    assert (picture.report["slabs"] > 1) == (request.param is not None)
+    return picture.image[2].astype(float)  # of four rows, all alike
 
 
 @pytest.mark.seconds

@@ -13,14 +13,15 @@ from clrecon.rendering.pictures.styles import Projection
 
 SPACING = (2.0, 2.0, 3.0)
 AIR, TISSUE, GAS = -1000, 40, -900
+RADIUS_MM, GAS_RADIUS_MM = 60.0, 16.0
 
 
 @pytest.fixture(scope="module")
 def trunk() -> Volume:
-    """A trunk of 60 mm radius in air, with a ball of gas of 16 mm radius, on a plate."""
+    """A trunk in air, with a ball of gas, on a plate, in 30 slices of 160 x 160 mm."""
     k, j, i = np.mgrid[:30, :80, :80].astype(float)
-    voxels = np.where(np.hypot((j - 35.0) * 2.0, (i - 40.0) * 2.0) <= 60.0, TISSUE, AIR)
-    ball = ((k - 15) * 3.0) ** 2 + ((j - 35) * 2.0) ** 2 + ((i - 40) * 2.0) ** 2 <= 16.0**2
+    voxels = np.where(np.hypot((j - 35.0) * 2.0, (i - 40.0) * 2.0) <= RADIUS_MM, TISSUE, AIR)
+    ball = ((k - 15) * 3.0) ** 2 + ((j - 35) * 2.0) ** 2 + ((i - 40) * 2.0) ** 2 <= GAS_RADIUS_MM**2
     voxels[ball] = GAS
     voxels[:, 70:72, 10:70] = 300
     return Volume(voxels.astype(np.int16), np.diag([*SPACING, 1.0]))
@@ -40,12 +41,15 @@ def test_lowest_values_are_those_of_gas_and_tissue_without_the_air_around(lowest
 
 def test_gas_covers_the_disc_of_its_ball(lowest_in_trunk: clrecon.Rendering) -> None:
     pixels = np.count_nonzero(lowest_in_trunk.values < (GAS + TISSUE) / 2)
-    assert pixels * lowest_in_trunk.pixel_mm**2 == pytest.approx(np.pi * 16.0**2, rel=0.2)  # pixels of some 3 mm
+    disc_mm2 = np.pi * GAS_RADIUS_MM**2
+    assert pixels * lowest_in_trunk.pixel_mm**2 == pytest.approx(disc_mm2, rel=0.2)  # pixels of some 3 mm
 
 
 def test_trunk_is_counted_without_its_skin(lowest_in_trunk: clrecon.Rendering) -> None:
-    width = np.count_nonzero(np.isfinite(lowest_in_trunk.values[30])) * lowest_in_trunk.pixel_mm
-    assert 2 * 60.0 - 16.0 <= width <= 2 * 60.0  # measured 106.6
+    middle_row = lowest_in_trunk.values[30]
+    width = np.count_nonzero(np.isfinite(middle_row)) * lowest_in_trunk.pixel_mm
+    skin_mm = 2 * RADIUS_MM - width
+    assert 3.0 < skin_mm <= 16.0  # of both sides; measured 13.4
 
 
 def test_pixels_beside_the_body_are_black_and_have_no_depth(lowest_in_trunk: clrecon.Rendering) -> None:
@@ -61,7 +65,7 @@ def test_voxels_that_are_left_out_are_reported_with_their_share(lowest_in_trunk:
     assert left_out["body"]
     assert left_out["share"] == pytest.approx(left_out["voxels"] / (30 * 80 * 80), abs=1e-4)  # four decimals
     # The skin is left out too; measured 0.06 more.
-    assert left_out["share"] == pytest.approx(1 - np.pi * 60.0**2 / 160.0**2, abs=0.1)
+    assert left_out["share"] == pytest.approx(1 - np.pi * RADIUS_MM**2 / 160.0**2, abs=0.1)
 
 
 def test_lowest_values_are_those_of_air_where_it_is_kept(trunk: Volume, device: object) -> None:

@@ -20,7 +20,7 @@ from clrecon.rendering.views.camera import Camera
 def free_ways_of_kernel(device, shape, distances, way: MainWay):
     """What the kernel says of a volume without anything in it, with these distances in place of its own."""
     resident, stopwatch = DeviceVolume(Volume(np.zeros(shape, np.int16), np.eye(4)), device=device), Stopwatch()
-    slab = next(ray_slabs(resident, shape[0], np.inf, stopwatch))
+    (slab,) = ray_slabs(resident, slices=shape[0], entry_k=np.inf, stopwatch=stopwatch)
     with stopwatch.running(device):
         ways_d = ray_pictures.look_ahead(resident, slab, way, LeapMap(upload(device, distances), None))
         return download(device, np.empty_like(distances), ways_d)
@@ -57,9 +57,9 @@ def test_free_bricks_ahead_are_those_counted_one_by_one_beside_the_distances(dev
     bricks = tuple(max(1, -(-(n - 1) // 4)) for n in shape)
     distances = np.where(rng.random(bricks) < 0.1, 0, rng.integers(1, FARTHEST + 1, bricks)).astype(np.uint8)
     if is_parallel:
-        way = MainWay(axis, ahead, np.array([0.01, -0.5, 0.7, 0.0], np.float32), 0.02)
+        way = MainWay(axis, ahead, eye=np.array([0.01, -0.5, 0.7, 0.0], np.float32), aside=0.02)
     else:
-        way = MainWay(axis, ahead, np.append(rng.uniform(-3.0, 10.0, 3), 1.0).astype(np.float32), 0.5)
+        way = MainWay(axis, ahead, eye=np.append(rng.uniform(-3.0, 10.0, 3), 1.0).astype(np.float32), aside=0.5)
 
     ways = free_ways_of_kernel(device, shape, distances, way)
 
@@ -70,13 +70,14 @@ def test_free_bricks_ahead_are_those_counted_one_by_one_beside_the_distances(dev
 def find_bright_leaps(device, voxels):
     """Distances of bricks from those with a voxel over 500 of 1000 HU, and the box of these."""
     resident, stopwatch = DeviceVolume(Volume(voxels, np.eye(4)), device=device), Stopwatch()
-    slab = next(ray_slabs(resident, len(voxels), np.inf, stopwatch))
+    (slab,) = ray_slabs(resident, slices=len(voxels), entry_k=np.inf, stopwatch=stopwatch)
     with stopwatch.running(device):
-        leaps = find_leaps(resident, slab, "key", np.arange(100) > 50, 0.0, 0.1)
+        leaps = find_leaps(resident, slab, "key", shown=np.arange(100) > 50, low=0.0, scale=100 / 1000)
         return download(device, np.empty(slab.bricks[::-1], np.uint8), leaps.distances_d), leaps.box
 
 
 def bright_bricks(voxels, counts):
+    """Which of so many bricks, (bk, bj, bi), hold a voxel over 500 HU."""
     bright = np.zeros(counts, bool)
     for brick in np.ndindex(counts):  # cells of a brick end at the voxels that the next one begins with
         bright[brick] = (voxels[tuple(slice(4 * n, 4 * n + 5) for n in brick)] > 500).any()
@@ -119,7 +120,7 @@ FRONT, MIDDLE, HEAD = (15.0, -400.0, 30.0), (15.0, 0.0, 30.0), (0.0, 0.0, 1.0)
 def main_way(device, camera):
     """Of a volume of 30 x 40 x 20 voxels of 1 x 2 x 3 mm, whose rows run against y."""
     resident = DeviceVolume(Volume(np.zeros((20, 40, 30), np.int16), np.diag([1.0, -2.0, 3.0, 1.0])), device=device)
-    slab = next(ray_slabs(resident, 20, np.inf, Stopwatch()))
+    (slab,) = ray_slabs(resident, slices=20, entry_k=np.inf, stopwatch=Stopwatch())
     assert slab.brick_cells == (4, 4, 2)
     return MainWay.of(resident, slab, camera)
 

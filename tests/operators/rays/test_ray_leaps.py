@@ -48,6 +48,7 @@ def take_every_sample(monkeypatch, *arguments, **settings) -> Rendering:
 
 
 def assert_same(one: Rendering, other: Rendering) -> None:
+    """Two pictures that show something have the same colours but for rounding, and the same depths."""
     assert (other.image[..., 3] > 0).any()
     difference = np.abs(one.image.astype(int) - other.image.astype(int))
     assert difference.max() <= tolerances.RAY_SAME_255
@@ -62,7 +63,8 @@ def test_leaps_hide_no_thin_slice_of_wide_voxels_at_a_wide_angle(device, monkeyp
     voxels[rng.integers(0, 300, 3)] = 1000
     thin = 10.0 ** rng.uniform(-1.3, -0.5)
     volume = Volume(voxels, np.diag([20.0, 20.0, thin, 1.0]))
-    position = volume.ijk_to_lps([[5.5, 5.5, 150.0]])[0] - (*rng.normal(0.0, 20.0, 2), 300 * thin * rng.uniform(0.6, 2))
+    (middle,) = volume.ijk_to_lps([[5.5, 5.5, 150.0]])
+    position = middle - (*rng.normal(0.0, 20.0, 2), 300 * thin * rng.uniform(0.6, 2))
     angle = float(rng.choice([100.0, 130.0, 150.0, 165.0]))
     camera = Camera(tuple(position), tuple(position + (0.0, 0.0, 1.0)), (0.0, 1.0, 0.0), view_angle=angle)
     settings = {"size": (16, 40), "ray_step": 2.0 * thin}
@@ -72,7 +74,7 @@ def test_leaps_hide_no_thin_slice_of_wide_voxels_at_a_wide_angle(device, monkeyp
     )
 
 
-def scattered(rng, uneven: bool) -> Volume:
+def scattered(rng, *, uneven: bool) -> Volume:
     """Single bright voxels, rows and slices on a turned, anisotropic, sheared or uneven grid."""
     shape = rng.integers(3, 50, 3)
     voxels = np.zeros(shape, np.int16)
@@ -100,7 +102,7 @@ def test_leaps_hide_no_scattered_voxel_from_anywhere(device, monkeypatch, uneven
     shown = 0
     for seed in range(40):
         rng = np.random.default_rng(seed)
-        volume = scattered(rng, uneven)
+        volume = scattered(rng, uneven=uneven)
         ends = volume.ijk_to_lps([np.zeros(3), np.array(volume.shape_ijk) - 1.0])
         radius = 0.6 * float(np.linalg.norm(ends[1] - ends[0]))
         towards, middle = rng.normal(size=3), ends.mean(axis=0)
@@ -129,7 +131,7 @@ def larger(rng, affine) -> Volume:
 def scene(seed: int):
     """A volume, a camera near it or looking along one of its axes, and settings."""
     rng = np.random.default_rng(seed)
-    volume = scattered(rng, False)
+    volume = scattered(rng, uneven=False)
     if seed % 2:
         volume = larger(rng, volume.affine)
     ends = volume.ijk_to_lps([np.zeros(3), np.array(volume.shape_ijk) - 1.0])

@@ -61,7 +61,7 @@ def test_impossible_pictures_are_refused_in_one_line(device, name):
     from clrecon.operators.rays.render import render
 
     settings, words = REFUSED[name]
-    volume = even_volume(blobs, "even", 8.0, np.int16)
+    volume = even_volume(blobs, "even", extent=8.0, dtype=np.int16)
     with pytest.raises(UsageError) as error:
         render(volume, device=device, **{"size": (8, 8), **settings})
     message = str(error.value)
@@ -81,7 +81,7 @@ def test_a_voxel_of_nan_is_refused_or_changes_its_own_pixels_alone(device):
     """NaN must neither end in a driver nor spread over pixels whose rays do not meet it."""
     from clrecon.operators.rays.render import render
 
-    volume = even_volume(lambda p: np.zeros(len(p)), "even", 12.0)
+    volume = even_volume(lambda p: np.zeros(len(p)), "even", extent=12.0)
     voxels = volume.voxels.copy()
     voxels[0, 0, 0] = np.nan
     camera = Camera.fit(volume, "anterior", size=(16, 16))

@@ -34,8 +34,8 @@ SIZE = (48, 36)
 STEEP = TransferFunction([(-200, 0.8, 0.1, 0.1, 0), (100, 1, 0.6, 0.3, 0), (130, 1, 0.9, 0.7, 0.9), (800, 1, 1, 1, 1)])
 LEVOY = TransferFunction(SOFT.points, unit_distance=2.0, gradient_opacity=[(20.0, 0.0), (150.0, 1.0), (600.0, 0.3)])
 LIT = Lighting()
-FADING = Lighting(0.2, 0.7, 0.4, 12.5, soft_gradient=150.0)
-FIXED = Lighting(0.15, 0.7, 0.4, 20.0, direction=(0.4, -1.0, 0.8))
+FADING = Lighting(ambient=0.2, diffuse=0.7, specular=0.4, specular_power=12.5, soft_gradient=150.0)
+FIXED = Lighting(ambient=0.15, diffuse=0.7, specular=0.4, specular_power=20.0, direction=(0.4, -1.0, 0.8))
 
 
 def noise(points: np.ndarray) -> np.ndarray:
@@ -43,6 +43,7 @@ def noise(points: np.ndarray) -> np.ndarray:
 
 
 def scene(volume: Volume, mode: str = "dvr", function: Any = None, /, **settings: Any) -> tuple[Volume, dict[str, Any]]:
+    """A volume, and the settings of a picture of it in one of the modes."""
     view = {name: settings.pop(name) for name in ("perspective", "towards", "half_height") if name in settings}
     camera = look(
         volume,
@@ -129,8 +130,8 @@ def test_raycast_by_kernels_of_users_equals_its_twin(device, name):
 @pytest.mark.every_device
 def test_flat_places_are_lit_as_by_the_twin(device):
     """A mask of two values: where it is flat, differences of float32 are noise."""
-    volume = even_volume(lambda p: np.where(np.abs(p).max(axis=1) < 7.0, 2613.0, -300.0), "oblique", 18.0, np.int16)
-    settings = scene(volume, "dvr", SOFT, lighting=FIXED)[1]
+    cube = lambda p: np.where(np.abs(p).max(axis=1) < 7.0, 2613.0, -300.0)  # noqa: E731
+    volume, settings = scene(even_volume(cube, "oblique", extent=18.0, dtype=np.int16), "dvr", SOFT, lighting=FIXED)
     assert_alike(DeviceCaster(device)(volume, **settings), TwinCaster()(volume, **settings), "dvr")
 
 
@@ -146,10 +147,11 @@ def test_flat_places_are_lit_as_by_the_twin(device):
 )
 def test_raycast_of_few_voxels_equals_its_twin(device, mode, function, even):
     """Small enough for a simulator: odd sizes, rays past the volume, clip planes, a light that stands still."""
-    volume = (
-        even_volume(blobs, "oblique", 6.0, np.int16) if even else uneven_volume(blobs, (9, 7), (1.0, 0.4, 1.9, 1.0))
-    )
-    camera = look(volume, (0.4, 1.0, -0.3), 5.0, perspective=True)
+    if even:
+        volume = even_volume(blobs, "oblique", extent=6.0, dtype=np.int16)
+    else:
+        volume = uneven_volume(blobs, shape=(9, 7), gaps=(1.0, 0.4, 1.9, 1.0))
+    camera = look(volume, (0.4, 1.0, -0.3), half_height=5.0, perspective=True)
     clip = Clip.plane(centre_of(volume), (0.3, 0.2, 1.0))
     settings = {"mode": mode, "camera": camera, "size": (11, 9), "clip": clip, "ray_step": 0.5}
     if mode == "dvr":
@@ -220,9 +222,9 @@ def test_pictures_of_one_camera_are_the_same_each_time(device):
 @pytest.mark.every_device
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (8, 8), (9, 7), (65, 33)])
 def test_pictures_of_any_size_have_all_their_pixels(device, size):
-    volume = even_volume(lambda p: np.zeros(len(p)), "oblique", 12.0, np.int16)
+    volume = even_volume(lambda p: np.zeros(len(p)), "oblique", extent=12.0, dtype=np.int16)
     fog = TransferFunction([(-10, 1, 1, 1, 0.2), (10, 1, 1, 1, 0.2)])
-    camera = Camera.fit(volume, (20.0, 30.0), 6.0, size=size)
+    camera = Camera.fit(volume, view=(20.0, 30.0), zoom=6.0, size=size)
     found, expected = (
         cast(volume, "dvr", fog, camera=camera, size=size) for cast in (DeviceCaster(device), TwinCaster())
     )

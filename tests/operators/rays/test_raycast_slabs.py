@@ -20,8 +20,8 @@ from clrecon.rendering.pictures.styles import PROJECTIONS
 @pytest.mark.parametrize("towards", [(0.1, 0.3, 1.0), (-0.1, 0.2, -1.0), (0.5, 1.0, 0.05)])
 @pytest.mark.parametrize("even", [True, False])
 def test_slabs_give_the_picture_depths_and_values_of_the_whole(device, mode, towards, even):
-    volume = even_volume(blobs, "oblique", 30.0, np.int16) if even else uneven_volume(blobs)
-    settings = {"mode": mode, "camera": look(volume, towards, 16.0, perspective=True), "size": (32, 24)}
+    volume = even_volume(blobs, "oblique", extent=30.0, dtype=np.int16) if even else uneven_volume(blobs)
+    settings = {"mode": mode, "camera": look(volume, towards, half_height=16.0, perspective=True), "size": (32, 24)}
     if mode == "dvr":
         settings |= {"transfer_function": SOFT, "lighting": Lighting()}
     share = 2.0 if mode == "dvr" else 0.6  # of the voxels' bytes; smoothed light takes three times as many as a whole

@@ -35,12 +35,13 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 @pytest.mark.parametrize("steps", STEPS)
 def test_mean_tells_the_chords_of_a_ball(cast, steps, perspective):
     radius, ramp, size = 18.0, 4.0 * np.linalg.norm(STEPS[steps], axis=0).max(), (32, 24)
-    volume = even_volume(ball(radius, ramp, 1000.0, -500.0), steps, 46.0)
+    inside, outside = 1000.0, -500.0
+    volume = even_volume(ball(radius, ramp, inside=inside, outside=outside), steps, extent=46.0)
     for towards in ((0.0, 1.0, 0.0), (0.3, 1.0, 0.2), (1.0, 0.4, -2.0)):
-        camera = look(volume, towards, 18.0, perspective=perspective)
+        camera = look(volume, towards, half_height=18.0, perspective=perspective)
         passing, _ = distances_from(centre_of(volume), camera, size)
         mean = cast(volume, "mean", camera=camera, size=size).values
-        chords = (mean + 500.0) / 1500.0 * ways_through(volume, camera, size)
+        chords = (mean - outside) / (inside - outside) * ways_through(volume, camera, size)
         well_inside = passing < 0.7 * radius
         assert well_inside.sum() > 50  # pixels; measured 88 and 216
         truth = ball_chords(radius, ramp, passing[well_inside])
@@ -54,13 +55,14 @@ def test_mean_tells_the_chords_of_a_box(cast, steps, perspective):
     size, low, high = (40, 30), np.array([6, 8, 4]), np.array([21, 25, 15])
     affine = np.eye(4)
     affine[:3, :3], affine[:3, 3] = STEPS[steps], PLACE
-    voxels = np.full((20, 34, 28), -200, np.int16)
-    voxels[low[2] : high[2] + 1, low[1] : high[1] + 1, low[0] : high[0] + 1] = 800
+    inside, outside = 800, -200
+    voxels = np.full((20, 34, 28), outside, np.int16)
+    voxels[low[2] : high[2] + 1, low[1] : high[1] + 1, low[0] : high[0] + 1] = inside
     volume = Volume(voxels, affine)
     for along in ((0.0, 1.0, 0.0), (0.2, 1.0, 0.1), (1.0, 0.2, -0.1)):
-        camera = look(volume, STEPS[steps] @ along, 6.0, perspective=perspective)
+        camera = look(volume, STEPS[steps] @ along, half_height=6.0, perspective=perspective)
         mean = cast(volume, "mean", camera=camera, size=size).values
-        chords = (mean + 200.0) / 1000.0 * ways_through(volume, camera, size)
+        chords = (mean - outside) / (inside - outside) * ways_through(volume, camera, size)
         clear = rays_off_edges(volume, camera, size, low, high)
         assert clear.sum() > 30  # pixels; measured 139 on
         ways = ways_through(volume, camera, size, low, high)
@@ -94,26 +96,27 @@ FINE_GAPS = (1.0,) * 18 + (0.4,) * 10 + (0.9,) * 20
 @pytest.mark.parametrize("steps", [*STEPS, "uneven"])
 def test_a_radiograph_tells_the_water_in_a_ball(cast, steps, perspective):
     """1.5 times as dense as water, in air: what lies beside the ball, within the volume or not, adds nothing."""
-    radius, size = 14.0, (32, 24)
-    spacing = 1.5 if steps == "uneven" else float(np.linalg.norm(STEPS[steps], axis=0).max())
-    ramp, field = 4.0 * spacing, ball(radius, 4.0 * spacing, 500.0, -1000.0)
-    volume = uneven_volume(field, gaps=FINE_GAPS) if steps == "uneven" else even_volume(field, steps, 46.0)
+    radius, size, air, density = 14.0, (32, 24), -1000.0, 1.5
+    spacing = 1.5 if steps == "uneven" else float(np.linalg.norm(STEPS[steps], axis=0).max())  # at least each step
+    ramp = 4.0 * spacing
+    field = ball(radius, ramp, inside=1000.0 * (density - 1.0), outside=air)
+    volume = uneven_volume(field, gaps=FINE_GAPS) if steps == "uneven" else even_volume(field, steps, extent=46.0)
     for towards in WATER_VIEWS:
-        camera = look(volume, towards, 22.0, perspective=perspective)
+        camera = look(volume, towards, half_height=22.0, perspective=perspective)
         passing, _ = distances_from(centre_of(volume), camera, size)
         water = cast(volume, "drr", camera=camera, size=size).values
         assert not water[passing > radius + 0.5 * ramp + 2.0 * spacing].any()
         well_inside = passing < 0.7 * radius
         assert well_inside.sum() > 50  # pixels; measured 88 and 216
-        truth = 1.5 * ball_chords(radius, ramp, passing[well_inside])
+        truth = density * ball_chords(radius, ramp, passing[well_inside])
         assert np.abs(water[well_inside] / truth - 1.0).max() <= tolerances.RAY_CHORD
 
 
 def test_a_radiograph_is_transparent_where_there_is_no_water_at_all(device):
     """A hundredth of water over 20 mm is 0.2 mm of it: little, but not nothing."""
-    volume = even_volume(ball(8.0, 2.0, -990.0, -1000.0), "even", 20.0)
+    volume = even_volume(ball(radius=8.0, ramp=2.0, inside=-990.0, outside=-1000.0), "even", extent=20.0)
     size = (24, 24)
-    camera = look(volume, (0.0, 1.0, 0.0), 14.0)
+    camera = look(volume, (0.0, 1.0, 0.0), half_height=14.0)
     found = DeviceCaster(device)(volume, mode="drr", camera=camera, size=size)
     passing, _ = distances_from(centre_of(volume), camera, size)
     assert 0.0 < found.values[passing < 4.0].max() < 1.0  # measured 0.16
@@ -133,7 +136,7 @@ def test_a_radiograph_tells_the_water_in_a_block_beside_padding(cast, steps, per
     voxels[low[2] : high[2] + 1, low[1] : high[1] + 1, low[0] : high[0] + 1] = 0
     volume = Volume(voxels, affine)
     for along in ((0.0, 1.0, 0.0), (0.2, 1.0, 0.1), (1.0, 0.2, -0.1), (0.3, 0.2, 1.0)):
-        camera = look(volume, STEPS[steps] @ along, 6.0, perspective=perspective)
+        camera = look(volume, STEPS[steps] @ along, half_height=6.0, perspective=perspective)
         water = cast(volume, "drr", camera=camera, size=size).values
         ways = ways_through(volume, camera, size, low, high)
         clear = rays_off_edges(volume, camera, size, low, high)
@@ -145,7 +148,10 @@ def test_a_radiograph_tells_the_water_in_a_block_beside_padding(cast, steps, per
 
 @pytest.fixture
 def water_at_45_degrees():
-    """A block of water of 40 mm seen along its diagonal, and mm of water along each of 110 rays; which miss edges."""
+    """A block of water of 40 mm seen along its diagonal, and mm of water along each of 110 rays; which miss edges.
+
+    Pictures of it have 20 rows, all alike.
+    """
     voxels = np.full((24, 48, 48), -1000, np.int16)
     voxels[4:20, 4:44, 4:44] = 0
     volume = Volume(voxels, np.eye(4))
@@ -160,14 +166,16 @@ def water_at_45_degrees():
 def test_the_box_of_a_volume_does_not_show_in_a_radiograph(cast, water_at_45_degrees):
     """A mean lights up where the box is short, a sum follows the way through the water."""
     volume, settings, way, off_edges = water_at_45_degrees
-    water = cast(volume, "drr", **settings).values[10]
+    middle_row = 10
+    water = cast(volume, "drr", **settings).values[middle_row]
     assert np.abs(water - way)[off_edges].max() <= tolerances.RAY_CHORD * way.max()
 
 
 def test_a_radiograph_of_half_a_block_tells_half_its_water(cast, water_at_45_degrees):
     volume, settings, way, off_edges = water_at_45_degrees
     clip = Clip.plane(centre_of(volume), (1.0, 1.0, 0.0))
-    water = cast(volume, "drr", **settings, clip=clip).values[10]
+    middle_row = 10
+    water = cast(volume, "drr", **settings, clip=clip).values[middle_row]
     assert np.abs(water - 0.5 * way)[off_edges].max() <= tolerances.RAY_CHORD * way.max()
 
 
@@ -212,7 +220,7 @@ def random_values(request, cast):
     rng = np.random.default_rng(6)
     volume = even_volume(lambda p: rng.integers(-1000, 2000, len(p)), request.param, 14.0, np.int16)
     size = (48, 40)
-    camera = look(volume, (0.7, 1.0, -0.4), 14.0, perspective=True)
+    camera = look(volume, (0.7, 1.0, -0.4), half_height=14.0, perspective=True)
     shots = [cast(volume, mode, camera=camera, size=size) for mode in ("mip", "mean", "minip")]
     return volume, *shots, ways_through(volume, camera, size)
 
@@ -245,9 +253,9 @@ def test_the_mean_lies_between_the_extremes(random_values):
 def test_the_depth_of_a_highest_value_is_where_the_ray_passes_it_nearest(cast, perspective):
     """HU fall with the distance from a place beside the centre."""
     place = np.array((2.0, 1.0, -3.0))
-    volume = even_volume(lambda p: -np.linalg.norm(p - place, axis=1), "oblique", 20.0)
+    volume = even_volume(lambda p: -np.linalg.norm(p - place, axis=1), "oblique", extent=20.0)
     size = (24, 24)
-    camera = look(volume, (0.4, 1.0, 0.3), 5.0, perspective=perspective)
+    camera = look(volume, (0.4, 1.0, 0.3), half_height=5.0, perspective=perspective)
     shot = cast(volume, "mip", camera=camera, size=size, ray_step=0.1)
     passing, along = distances_from(centre_of(volume) + place, camera, size)
     off_tip = passing > 1.5  # nearer, the trilinear field has no sharp tip
@@ -258,10 +266,10 @@ def test_the_depth_of_a_highest_value_is_where_the_ray_passes_it_nearest(cast, p
 @pytest.mark.parametrize("mode", ["mip", "minip", "mean"])
 def test_thin_slabs_between_clip_planes_show_the_values_in_them(cast, mode):
     """Of 0.1 mm, thinner than a step and than a voxel, in a field of 100 HU a mm: 205 to 215 HU."""
-    volume = even_volume(lambda p: 100.0 * p[:, 1], "even", 20.0)
+    volume = even_volume(lambda p: 100.0 * p[:, 1], "even", extent=20.0)
     centre = centre_of(volume)
     slab = Clip.box(centre + (-99, 2.05, -99), centre + (99, 2.15, 99))
-    values = cast(volume, mode, camera=look(volume, (0.0, 1.0, 0.0), 6.0), size=(8, 8), clip=slab).values
+    values = cast(volume, mode, camera=look(volume, (0.0, 1.0, 0.0), half_height=6.0), size=(8, 8), clip=slab).values
     assert np.abs(values - 210.0).max() <= 5.0 + tolerances.RAY_AXIS_HU
 
 

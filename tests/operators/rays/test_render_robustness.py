@@ -26,7 +26,7 @@ HARD = TransferFunction([(0, 1, 0, 0, 0.0), (200, 1, 1, 0, 0.6)])
 
 
 def random_body(
-    shape: tuple[int, int, int] = (12, 16, 20), spacing: tuple[float, float, float] = (0.9, 0.8, 1.2)
+    *, shape: tuple[int, int, int] = (12, 16, 20), spacing: tuple[float, float, float] = (0.9, 0.8, 1.2)
 ) -> Volume:
     """HU from 100 to 1499 at random, in air."""
     voxels = np.full(shape, -1000, np.int16)
@@ -35,9 +35,10 @@ def random_body(
     return Volume(voxels, np.diag([*spacing, 1.0]))
 
 
-def camera_along_k(volume: Volume, scale: float, away: float = 1000.0) -> Camera:
+def camera_along_k(volume: Volume, *, scale: float) -> Camera:
+    """A metre below the middle of the volume; a picture is twice `scale` mm high."""
     centre = 0.5 * (np.array(volume.shape_ijk) - 1) * volume.spacing
-    return Camera(tuple(centre - [0, 0, away]), tuple(centre), (1, 0, 0), parallel_scale=scale)
+    return Camera(tuple(centre - [0, 0, 1000.0]), tuple(centre), (1, 0, 0), parallel_scale=scale)
 
 
 MODES = pytest.mark.parametrize("mode", ["dvr", "mip", "mean", "surface"])
@@ -46,14 +47,14 @@ MODES = pytest.mark.parametrize("mode", ["dvr", "mip", "mean", "surface"])
 @MODES
 def test_picture_of_slices_ten_million_pixels_apart_is_made(device, mode):
     """Half the smallest spacing is 5e-8 of the way between two slices: float32 would count without ever arriving."""
-    volume = random_body((24, 16, 20), (1e-4, 1.0, 1000.0))
-    picture = clrecon.render(volume, mode, camera=camera_along_k(volume, 1e-3), size=(4, 4), device=device)
+    volume = random_body(shape=(24, 16, 20), spacing=(1e-4, 1.0, 1000.0))
+    picture = clrecon.render(volume, mode, camera=camera_along_k(volume, scale=1e-3), size=(4, 4), device=device)
     assert picture.image[..., :3].any()
 
 
 @MODES
 def test_a_given_ray_step_of_too_many_samples_is_refused(device, mode):
-    volume = random_body((24, 16, 20), (1e-4, 1.0, 1000.0))
+    volume = random_body(shape=(24, 16, 20), spacing=(1e-4, 1.0, 1000.0))
     with refused(UsageError, "step"):
         clrecon.render(volume, mode, ray_step=5e-5, size=(4, 4), device=device)
 
@@ -117,8 +118,8 @@ def test_a_background_by_an_array_is_that_by_name(device, mode, options):
         {"ray_step": 1e300},
         {"clip": Clip([(0, 0, 1, -1e300)])},
         {"clip": Clip.plane((0, 0, 0), (0, 0, 1e300))},
-        {"camera": camera_along_k(random_body(), 1e9)},
-        {"camera": camera_along_k(random_body(), 1e-9)},
+        {"camera": camera_along_k(random_body(), scale=1e9)},
+        {"camera": camera_along_k(random_body(), scale=1e-9)},
         {"camera": Camera((0, 0, 0), (1, 0, 0), (0, 0, 1e200), view_angle=179.0)},
     ],
     ids=["ray step", "clip offset", "clip normal", "wide", "narrow", "up and angle"],
@@ -131,7 +132,7 @@ def test_numbers_at_the_ends_of_their_ranges_make_opaque_pictures_without_a_warn
 @pytest.mark.parametrize("away", [-3e5, 3e5], ids=["beyond", "far before"])
 def test_picture_in_slabs_is_the_same_wherever_a_parallel_camera_is_along_its_rays(device, away):
     """Its position only measures depths: slabs come in the order of the rays."""
-    volume = random_body((40, 16, 20))
+    volume = random_body(shape=(40, 16, 20))
     centre = 0.5 * (np.array(volume.shape_ijk) - 1) * volume.spacing
     forward = np.array([0.0, 0.6, 0.8])
 
@@ -180,8 +181,9 @@ def test_a_device_with_too_little_memory_is_refused_with_its_bytes(device, monke
 
 
 def test_a_device_with_small_buffers_makes_a_picture_in_slabs(device, monkeypatch):
-    monkeypatch.setattr(device, "max_allocation_bytes", 7000)  # the volume has 7,680
-    assert clrecon.render(random_body(), size=(8, 8), device=device).report["slabs"] > 1
+    volume = random_body()
+    monkeypatch.setattr(device, "max_allocation_bytes", volume.voxels.nbytes - 680)
+    assert clrecon.render(volume, size=(8, 8), device=device).report["slabs"] > 1
 
 
 def test_the_largest_picture_is_refused_with_the_buffer_that_is_too_large(device):

@@ -53,7 +53,7 @@ def screen(y: float, half: float = 200.0) -> Mesh:
     return Mesh(corners, [(0, 1, 2), (0, 2, 3)])
 
 
-def ways(camera: Camera, y: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def ways(camera: Camera, *, y: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return mm of each ray within the block before and behind the plane y, and mm to the plane."""
     origins, directions = camera.rays(SIZE)
     with np.errstate(divide="ignore"):
@@ -71,16 +71,16 @@ SCREEN_Y = 3.0
 class ScreenInFog:
     """A green screen of some opacity at y = 3 mm in red fog: the picture, the slabs it took, and mm of each ray."""
 
-    def __init__(self, device: Any, camera: Camera, opacity: float, in_slabs: bool, monkeypatch: pytest.MonkeyPatch):
+    def __init__(self, device: Any, camera: Camera, patch: pytest.MonkeyPatch, *, opacity: float, in_slabs: bool):
         self.opacity, self.slabs = opacity, 0
-        self.before, self.behind, self.plane = ways(camera, SCREEN_Y)
+        self.before, self.behind, self.plane = ways(camera, y=SCREEN_Y)
 
         def count_slabs(*arguments: Any) -> Any:
             for slab in ray_slabs(*arguments):
                 self.slabs += 1
                 yield slab
 
-        monkeypatch.setattr("clrecon.operators.rays.ray_slabs.ray_slabs", count_slabs)
+        patch.setattr("clrecon.operators.rays.ray_slabs.ray_slabs", count_slabs)
         look = MeshLook((0.0, 1.0, 0.0), opacity=opacity, lighting=UNSHADED)
         fog = VolumeLook(FOG, lighting=UNSHADED)
         self.picture = clrecon.render(
@@ -97,8 +97,9 @@ class ScreenInFog:
     ids=str,
 )
 def screen_in_fog(request: pytest.FixtureRequest, device: Any, monkeypatch: pytest.MonkeyPatch) -> ScreenInFog:
+    """A screen of either opacity seen by one of the cameras, the fog on the device as a whole or in slabs."""
     name, opacity, in_slabs = request.param
-    return ScreenInFog(device, CAMERAS[name], opacity, in_slabs, monkeypatch)
+    return ScreenInFog(device, CAMERAS[name], monkeypatch, opacity=opacity, in_slabs=in_slabs)
 
 
 @pytest.mark.seconds
@@ -142,7 +143,7 @@ def test_a_scene_takes_a_pass_over_the_volume_for_an_opaque_screen_and_two_for_a
 def test_depth_of_an_opaque_screen_beside_or_hardly_in_fog_is_its_own(
     device: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    scene = ScreenInFog(device, CAMERAS["parallel"], 1.0, False, monkeypatch)
+    scene = ScreenInFog(device, CAMERAS["parallel"], monkeypatch, opacity=1.0, in_slabs=False)
     beside = (scene.before + scene.behind == 0.0) & (scene.plane > 0.0)
     hardly_in = (scene.before > 0.0) & (scene.before < 0.02)
     clear = beside | hardly_in
@@ -153,7 +154,7 @@ def test_depth_of_an_opaque_screen_beside_or_hardly_in_fog_is_its_own(
 def test_report_of_a_scene_names_its_objects_and_its_mode_is_that_of_the_volume(
     device: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    picture = ScreenInFog(device, CAMERAS["parallel"], 1.0, False, monkeypatch).picture
+    picture = ScreenInFog(device, CAMERAS["parallel"], monkeypatch, opacity=1.0, in_slabs=False).picture
     assert picture.report["objects"] == ["dvr", "mesh"]
     assert picture.mode == "dvr"
 
@@ -163,7 +164,7 @@ class SpeckInFog:
 
     def __init__(self, device: Any) -> None:
         camera = CAMERAS["perspective"]
-        vertices, triangles = ball(1.0, 12)
+        vertices, triangles = ball(radius=1.0, rings=12)
         speck = Mesh(np.array(vertices) + (4.5, -20.0, 6.0), triangles)
         fog = block_of_fog(), VolumeLook(FOG)
         settings: dict[str, Any] = {"camera": camera, "size": SIZE, "device": device, "background": "transparent"}
@@ -176,6 +177,7 @@ class SpeckInFog:
 
 @pytest.fixture(scope="module")
 def speck_in_fog(device: Any) -> SpeckInFog:
+    """A speck before a block of fog."""
     return SpeckInFog(device)
 
 
@@ -204,25 +206,25 @@ def test_slices_before_and_behind_a_mesh_are_blended_in_order(device: Any, name:
     picture = clrecon.render(shown, camera=camera, size=SIZE, device=device, background="transparent")
     origins, directions = camera.rays(SIZE)
     plane = (1.0 - origins[..., 1]) / directions[..., 1]
-    layers = [(plane, np.full(plane.shape, opacity), np.array((0.0, 1.0, 0.0)))]
+    layers = [(plane, np.full(plane.shape, opacity), np.array((0.0, 1.0, 0.0)))]  # depth, opacity and colour
     for k in chosen:
         way = (AFFINE[2, 3] + k - origins[..., 2]) / directions[..., 2]
         place = origins + way[..., None] * directions
         held = (np.abs(place[..., :2]) <= 0.5 * SIDE).all(axis=-1) & (way > 0.0)
         layers.append((way, np.where(held, 0.5, 0.0), np.full(3, 0.5)))
-    depths = np.stack([layer[0] for layer in layers])
+    depths, opacities, colors = (np.stack(part) for part in zip(*layers, strict=True))
     order = np.argsort(depths, axis=0)
     rgba = np.zeros((*plane.shape, 4))
-    for step in order:
-        share = np.take_along_axis(np.stack([layer[1] for layer in layers]), step[None], axis=0)[0]
-        color = np.stack([layer[2] for layer in layers])[step]
+    for nearest_first in order:
+        (share,) = np.take_along_axis(opacities, nearest_first[None], axis=0)
         weight = ((1.0 - rgba[..., 3]) * share)[..., None]
-        rgba += weight * np.concatenate([color, np.ones((*plane.shape, 1))], axis=-1)
+        rgba += weight * np.concatenate([colors[nearest_first], np.ones((*plane.shape, 1))], axis=-1)
     alpha = picture.image[..., 3:].astype(float)
     premultiplied = np.concatenate([picture.image[..., :3] * alpha / 255.0, alpha], axis=-1)
     off = np.abs(premultiplied - 255.0 * rgba).max(axis=-1) > tolerances.LAYER_LEVELS
     assert off.mean() < 0.01  # rims of slices
-    assert len(np.unique(np.argwhere(order.reshape(5, -1).T == 0)[:, 1])) >= 3  # places of the mesh among the slices
+    places_of_mesh = np.argmin(order, axis=0)  # among the slices: the mesh is layer 0
+    assert len(np.unique(places_of_mesh)) >= 3
 
 
 LEFT_POINT, RIGHT_POINT = (-9.0, -20.0, 0.0), (9.0, 20.0, 0.0)
@@ -246,13 +248,14 @@ def red_points_glass_bone_and_blue_screen(device: Any) -> clrecon.Rendering:
 
 def color_and_depth(picture: clrecon.Rendering, place: tuple[float, float, float]) -> tuple[tuple[int, ...], float]:
     """Of the pixel where the camera projects a place."""
-    pixels, _ = CAMERAS["parallel"].project([place], (120, 80))
-    column, row = pixels[0].astype(int)
+    ((column, row),), _ = CAMERAS["parallel"].project([place], (120, 80))
+    row, column = int(row), int(column)
     return tuple(picture.image[row, column, :3].tolist()), float(picture.depth[row, column])
 
 
 def depth_of(place: tuple[float, float, float]) -> float:
-    return float(CAMERAS["parallel"].project([place], SIZE)[1][0])
+    _, (depth,) = CAMERAS["parallel"].project([place], SIZE)
+    return float(depth)
 
 
 def test_a_point_before_all_is_seen_at_its_depth(red_points_glass_bone_and_blue_screen: clrecon.Rendering) -> None:
@@ -282,37 +285,38 @@ def test_report_of_a_scene_lists_its_objects_in_their_order(
     assert red_points_glass_bone_and_blue_screen.report["objects"] == ["points", "mesh", "surface", "mesh"]
 
 
+BALL_RADIUS = 5.0
+BALL = Mesh(*ball(BALL_RADIUS, rings=10))
+
+
 def test_camera_of_a_scene_with_a_mesh_within_its_volume_is_that_of_the_volume(device: Any) -> None:
     fog = block_of_fog(), VolumeLook(FOG)
     alone = clrecon.render(*fog, size=SIZE, device=device)
-    assert clrecon.render([fog, Mesh(*ball(5.0, 10))], size=SIZE, device=device).camera == alone.camera
+    assert clrecon.render([fog, BALL], size=SIZE, device=device).camera == alone.camera
 
 
 def test_camera_of_a_scene_sees_a_mesh_beside_its_volume_and_the_volume(device: Any) -> None:
-    vertices, triangles = ball(5.0, 10)
-    beside = Mesh(np.array(vertices) + (80.0, 0.0, 0.0), triangles)
+    beside = Mesh(BALL.vertices + np.float32((80.0, 0.0, 0.0)), BALL.triangles)
     camera = clrecon.render([(block_of_fog(), VolumeLook(FOG)), beside], size=SIZE, device=device).camera
     assert camera is not None
-    ends = [(80.0 + 5.0, 0.0, 0.0), (-0.5 * SIDE, 0.0, 0.0)]
+    ends = [(80.0 + BALL_RADIUS, 0.0, 0.0), (-0.5 * SIDE, 0.0, 0.0)]
     pixels, _ = camera.project(ends, SIZE)
     assert ((pixels > 0.0) & (pixels < SIZE)).all()
 
 
 def test_pictures_of_one_scene_are_the_same_each_time_and_from_the_device(device: Any) -> None:
-    with ScenePictures(
-        [(block_of_fog(), VolumeLook(FOG)), (Mesh(*ball(5.0, 10)), MeshLook())], device=device
-    ) as pictures:
+    with ScenePictures([(block_of_fog(), VolumeLook(FOG)), (BALL, MeshLook())], device=device) as pictures:
         one = pictures.take(CAMERAS["parallel"], SIZE)
         other = pictures.take(CAMERAS["inside"], SIZE)
         again = pictures.take(CAMERAS["parallel"], SIZE)
         assert pictures.device is device
     assert one.image.tobytes() == again.image.tobytes() != other.image.tobytes()
     resident = clrecon.DeviceVolume(block_of_fog(), device=device)
-    with ScenePictures([(resident, VolumeLook(FOG)), (Mesh(*ball(5.0, 10)), MeshLook())], device=device) as pictures:
+    with ScenePictures([(resident, VolumeLook(FOG)), (BALL, MeshLook())], device=device) as pictures:
         assert pictures.take(CAMERAS["parallel"], SIZE).image.tobytes() == one.image.tobytes()
 
 
-BALL, FOG_VOLUME = Mesh(*ball(5.0, 10)), block_of_fog()
+FOG_VOLUME = block_of_fog()
 
 
 @pytest.mark.parametrize(

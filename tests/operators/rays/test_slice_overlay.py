@@ -26,12 +26,13 @@ SIZE = (56, 48)
 WINDOW = (-500.0, 700.0)
 
 
-def overlay_slices(resident, camera, size, *, background=None, **look):
-    return operator.overlay_slices(resident, SlicesInSpace(**look), Shot(camera, size, background))
+def overlay_slices(resident, camera, size, **look):
+    return operator.overlay_slices(resident, SlicesInSpace(**look), Shot(camera, size))
 
 
-def assert_overlay_equals_twin(device, volume, camera, slices, clip=None, opacity=0.4, lowest=-300.0, **settings):
-    style = SlicesInSpace(slices, opacity=opacity, lowest_hu=lowest, window=WINDOW, clip=clip, **settings)
+def assert_overlay_equals_twin(device, volume, camera, *, slices, clip=None, opacity=0.4):
+    """The picture of some slices has the colours and depths of the twin's but for edges; return it."""
+    style = SlicesInSpace(slices, opacity=opacity, lowest_hu=-300.0, window=WINDOW, clip=clip)
     found = operator.overlay_slices(DeviceVolume(volume, device=device), style, Shot(camera, SIZE))
     rgba, depth = overlay_twin(volume, camera, SIZE, style)
     assert (rgba[..., 3] > 0).mean() > 0.2  # measured 0.41 on
@@ -49,27 +50,30 @@ def assert_overlay_equals_twin(device, volume, camera, slices, clip=None, opacit
 @pytest.mark.parametrize("grid", GRIDS)
 def test_slice_overlay_equals_its_twin(device, grid, perspective):
     volume = make_volume(blobs, grid, dtype=np.int16)
-    assert_overlay_equals_twin(device, volume, look(volume, (0.4, 0.8, -0.7), 14.0, perspective), [1, 4, 7, 12])
+    camera = look(volume, (0.4, 0.8, -0.7), half_height=14.0, perspective=perspective)
+    assert_overlay_equals_twin(device, volume, camera, slices=[1, 4, 7, 12])
 
 
 def test_slices_from_below_behind_a_clip_plane_equal_the_twin(device):
     volume = make_volume(blobs, "uneven")
     clip = Clip.plane(centre_of(volume), (0.5, 0.4, 1.0))
-    assert_overlay_equals_twin(device, volume, look(volume, (0.3, -0.6, 0.8), 14.0), [2, 3, 9, 14, 15], clip)
+    from_below = look(volume, (0.3, -0.6, 0.8), half_height=14.0)
+    assert_overlay_equals_twin(device, volume, from_below, slices=[2, 3, 9, 14, 15], clip=clip)
 
 
 def test_a_camera_between_bright_upper_and_dark_lower_slices_sees_both_as_the_twin(device):
-    volume = make_volume(lambda p: 100.0 + 20.0 * p[:, 2], "even", 22.0, np.int16)
+    volume = make_volume(lambda p: 100.0 + 20.0 * p[:, 2], "even", extent=22.0, dtype=np.int16)
     centre = centre_of(volume) + (0.0, 0.0, 0.4)
     camera = Camera(tuple(centre), tuple(centre + (0.0, 1.0, 0.0)), (0, 0, 1), view_angle=120.0)
-    found = assert_overlay_equals_twin(device, volume, camera, [3, 9, 15, 21], opacity=1.0)
-    assert found.image[:20, :, 0].mean() > found.image[-20:, :, 0].mean() + 10  # bright above, dark below
+    found = assert_overlay_equals_twin(device, volume, camera, slices=[3, 9, 15, 21], opacity=1.0)
+    upper, lower = found.image[:20, :, 0], found.image[-20:, :, 0]  # of 48 rows
+    assert upper.mean() > lower.mean() + 10
 
 
 @pytest.mark.oclgrind
 def test_overlay_of_few_slices_equals_the_twin(device):
-    volume = make_volume(blobs, "sheared", 6.0, np.int16)
-    camera = look(volume, (0.4, 0.8, -0.7), 5.0)
+    volume = make_volume(blobs, "sheared", extent=6.0, dtype=np.int16)
+    camera = look(volume, (0.4, 0.8, -0.7), half_height=5.0)
     found = overlay_slices(DeviceVolume(volume, device=device), camera, (12, 9), slices=[0, 2, 4], window=WINDOW)
     rgba, _ = overlay_twin(volume, camera, (12, 9), SlicesInSpace([0, 2, 4], window=WINDOW))
     away = np.abs(premultiplied(found.image) - 255.0 * rgba).max(axis=-1)
@@ -80,11 +84,11 @@ def test_overlay_of_few_slices_equals_the_twin(device):
 def marked_voxels(request, device):
     """A volume of air with a patch of 3 x 3 voxels of 600 HU in slice k, its place, a camera, and k."""
     grid, perspective = request.param
-    volume = make_volume(lambda p: np.full(len(p), -900.0), grid, 16.0, np.int16)
+    volume = make_volume(lambda p: np.full(len(p), -900.0), grid, extent=16.0, dtype=np.int16)
     k, j, i = volume.voxels.shape[0] // 3, volume.voxels.shape[1] // 2, 5
     voxels = volume.voxels.copy()
     voxels[k, j - 1 : j + 2, i - 1 : i + 2] = 600
-    camera = look(volume, (0.2, 0.5, 0.9), 12.0, perspective)
+    camera = look(volume, (0.2, 0.5, 0.9), half_height=12.0, perspective=perspective)
     resident = DeviceVolume(volume.with_voxels(voxels), device=device)
     return resident, volume.ijk_to_lps([(i, j, k)]), camera, k
 
@@ -93,12 +97,12 @@ def test_marked_voxels_are_seen_alone_where_the_camera_projects_them(marked_voxe
     resident, place, camera, k = marked_voxels
     size = (160, 160)
     found = overlay_slices(resident, camera, size, slices=[0, k, k + 1], opacity=0.7)
-    pixels, depths = camera.project(place, size)
-    column, row = pixels[0].astype(int)
+    (pixel,), (depth,) = camera.project(place, size)
+    column, row = pixel.astype(int)
     assert found.image[row, column, 3] == round(0.7 * 255)
-    assert found.depth[row, column] == pytest.approx(depths[0], abs=camera.pixel_mm(size))
+    assert found.depth[row, column] == pytest.approx(depth, abs=camera.pixel_mm(size))
     seen = np.argwhere(found.image[..., 3] > 0)
-    assert np.abs(seen.mean(axis=0)[::-1] + 0.5 - pixels[0]).max() < 1.0  # a patch around it, and nothing else
+    assert np.abs(seen.mean(axis=0)[::-1] + 0.5 - pixel).max() < 1.0  # a patch around it, and nothing else
 
 
 def test_overlay_of_other_slices_than_that_of_marked_voxels_is_empty(marked_voxels):
@@ -114,8 +118,8 @@ def stair(device):
     voxels = np.zeros((8, 12, 12), np.int16) + 100 * np.arange(8, dtype=np.int16)[:, None, None]
     volume = Volume(voxels, np.diag([1.0, 1.0, 2.0, 1.0]))
 
-    def overlay(from_side, slices, opacity):
-        camera = look(volume, (0.0, 0.01, -1.0 if from_side == "head" else 1.0), 4.0)
+    def overlay(from_side, *, slices, opacity):
+        camera = look(volume, (0.0, 0.01, -1.0 if from_side == "head" else 1.0), half_height=4.0)
         return overlay_slices(
             DeviceVolume(volume, device=device), camera, (8, 8), slices=slices, opacity=opacity,
             window=(0.0, 700.0), lowest_hu=-1000.0,
@@ -125,42 +129,37 @@ def stair(device):
 
 
 def test_three_slices_let_through_what_each_lets_through(stair):
-    found = stair("head", [1, 3, 6], opacity=0.25)
+    found = stair("head", slices=[1, 3, 6], opacity=0.25)
     assert (found.image[..., 3] == round(255 * (1.0 - 0.75**3))).all()
 
 
 @pytest.mark.parametrize(("from_side", "front"), [("head", 6), ("feet", 0)])
 def test_the_front_slice_of_opaque_ones_hides_the_others(stair, from_side, front):
-    """Every third slice: 0, 3 and 6."""
-    found = stair(from_side, 3, opacity=1.0)
+    """Slice 6 has 600 HU, in a window of 0 to 700."""
+    found = stair(from_side, slices=[0, 3, 6], opacity=1.0)
     assert (found.image[..., 0] == round(255 * 100 * front / 700)).all()
     assert (found.image[..., 3] == 255).all()
 
 
 def test_depth_of_opaque_slices_is_that_of_the_front_one(stair):
     """Slice 6 lies 5 mm above the middle, which is 200 mm away."""
-    assert stair("head", 3, opacity=1.0).depth == pytest.approx(np.full((8, 8), 200.0 - 5.0), abs=0.1)  # it leans
+    found = stair("head", slices=[0, 3, 6], opacity=1.0)
+    assert found.depth == pytest.approx(np.full((8, 8), 200.0 - 5.0), abs=0.1)  # it leans
 
 
 def test_slices_take_the_colours_of_a_transfer_function(device):
-    volume = make_volume(lambda p: np.full(len(p), 150.0), "even", 8.0, np.int16)
+    volume = make_volume(lambda p: np.full(len(p), 150.0), "even", extent=8.0, dtype=np.int16)
     function = TransferFunction([(0, 1, 0, 0, 0), (300, 0, 1, 0, 0)])  # red at 0 HU, green at 300 HU
-    found = overlay_slices(
-        DeviceVolume(volume, device=device),
-        look(volume, (0.0, 0.1, -1.0), 2.0),
-        (4, 4),
-        slices=[4],
-        opacity=1.0,
-        transfer_function=function,
-    )
+    camera, style = look(volume, (0.0, 0.1, -1.0), half_height=2.0), {"opacity": 1.0, "transfer_function": function}
+    found = overlay_slices(DeviceVolume(volume, device=device), camera, (4, 4), slices=[4], **style)
     assert np.abs(found.image[..., :3].astype(int) - (128, 128, 0)).max() <= 1  # 150 HU are half way: 127.5 of 255
 
 
 @pytest.fixture
 def ten_slices():
     """A volume, a camera and settings of ten slices; bytes of the picture and of a slice."""
-    volume = make_volume(blobs, "oblique", 26.0, np.int16)
-    camera, size = look(volume, (0.4, 0.8, -0.7), 14.0, True), (16, 12)
+    volume = make_volume(blobs, "oblique", extent=26.0, dtype=np.int16)
+    camera, size = look(volume, (0.4, 0.8, -0.7), half_height=14.0, perspective=True), (16, 12)
     bytes_a_pixel = 44
     return volume, camera, size, list(range(0, 20, 2)), bytes_a_pixel * size[0] * size[1], volume.voxels[0].nbytes
 
@@ -183,7 +182,7 @@ def test_an_overlay_without_room_for_a_slice_is_refused(device, ten_slices):
 
 @pytest.mark.parametrize(("view", "warned"), [("anterior", True), ((30, 20), False)], ids=["edge-on", "slanted"])
 def test_slices_that_are_seen_edge_on_are_warned_of(device, view, warned):
-    volume = make_volume(blobs, "even", 8.0, np.int16)
+    volume = make_volume(blobs, "even", extent=8.0, dtype=np.int16)
     found = overlay_slices(DeviceVolume(volume, device=device), Camera.fit(volume, view), (8, 8))
     assert ["edge-on" in text for text in found.report["warnings"]] == [True] * warned
 
@@ -201,7 +200,8 @@ def test_slices_without_a_view_are_seen_at_a_slant(device, axis, in_scene):
         picture = clrecon.render(volume, "slices", size=(64, 64), device=device)
     assert not [text for text in picture.report["warnings"] if "edge-on" in text]
     assert np.isfinite(picture.depth).mean() > 0.25  # measured 0.62 on
-    assert np.allclose(picture.camera.basis().forward, -find_view((30, 30))[0])
+    towards_camera, _ = find_view((30, 30))
+    assert np.allclose(picture.camera.basis().forward, -towards_camera)
 
 
 @pytest.mark.parametrize(
@@ -231,7 +231,7 @@ def test_slices_are_chosen_evenly_or_by_number(slices, given, chosen):
     ],
 )
 def test_wrong_arguments_of_an_overlay_are_refused(device, wrong, says):
-    volume = make_volume(blobs, "even", 8.0, np.int16)
+    volume = make_volume(blobs, "even", extent=8.0, dtype=np.int16)
     with pytest.raises(UsageError, match=says):
         overlay_slices(DeviceVolume(volume, device=device), Camera.fit(volume), (8, 8), **wrong)
 
@@ -240,7 +240,7 @@ def test_progress_of_an_overlay_counts_its_slices(device):
     volume = make_volume(blobs, "uneven", dtype=np.int16)
     told: list[tuple] = []
     style = SlicesInSpace(slices=[1, 4, 7], opacity=0.4, lowest_hu=-300.0, window=WINDOW)
-    camera = look(volume, (0.4, 0.8, -0.7), 14.0, False)
+    camera = look(volume, (0.4, 0.8, -0.7), half_height=14.0, perspective=False)
     resident = DeviceVolume(volume, device=device)
     operator.overlay_slices(resident, style, Shot(camera, SIZE, progress=lambda *said: told.append(said)))
     assert told == [("slabs", 0, 3), ("slabs", 3, 3)]

@@ -27,7 +27,7 @@ def distances_from_ball() -> tuple[np.ndarray, np.ndarray]:
     return RADIUS_MM - outside, np.diag([1.0, 1.0, 1.25, 1.0])
 
 
-def noisy_ball(noise_hu: float = 40.0) -> Volume:
+def noisy_ball(*, noise_hu: float = 40.0) -> Volume:
     """The ball as a scanner shows it: 40 HU outside, 600 inside, an edge of two voxels, and noise."""
     distances, affine = distances_from_ball()
     noise = np.random.default_rng(7).normal(0.0, noise_hu, distances.shape)
@@ -50,7 +50,8 @@ def error_of_light(picture: Rendering, true_image: np.ndarray) -> float:
 
 def test_smoothed_light_is_nearer_to_that_of_true_normals(device: Any) -> None:
     volume = noisy_ball()
-    true_field = (200.0 * distances_from_ball()[0]).astype(np.int16)  # its gradients are the normals of the ball
+    distances, _ = distances_from_ball()
+    true_field = (200.0 * distances).astype(np.int16)  # its gradients are the normals of the ball
     truth = cast_rays(volume, VolumeLook(BONE), camera_of(volume), SIZE, lit=true_field).image()
 
     smoothed = error_of_light(render(volume, device), truth)
@@ -74,15 +75,17 @@ def test_report_has_the_smoothing_that_was_used(device: Any, asked: float, repor
 
 
 def test_default_smoothing_is_a_voxel_without_noise() -> None:
-    assert choose_smoothing(noisy_ball(0.0)) == pytest.approx(1.25 ** (1.0 / 3.0))
+    side_of_a_cube_of_a_voxel = (1.0 * 1.0 * 1.25) ** (1.0 / 3.0)
+    assert choose_smoothing(noisy_ball(noise_hu=0.0)) == pytest.approx(side_of_a_cube_of_a_voxel)
 
 
 def test_default_smoothing_grows_with_noise() -> None:
     """White noise of n HU leaves 3 HU per mm in the gradients at (n sqrt(v) / (3 * 9.44)) ^ 0.4 mm, v the voxel."""
-    rng = np.random.default_rng(3)
-    volume = Volume(rng.normal(40.0, 60.0, (24, 96, 96)).astype(np.int16), np.eye(4))
+    noise_hu = 60.0
+    voxels = np.random.default_rng(3).normal(40.0, noise_hu, (24, 96, 96))
+    volume = Volume(voxels.astype(np.int16), np.eye(4))
 
-    assert choose_smoothing(volume) == pytest.approx((60.0 / (3.0 * 9.44)) ** 0.4, rel=0.03)  # noise by blocks
+    assert choose_smoothing(volume) == pytest.approx((noise_hu / (3.0 * 9.44)) ** 0.4, rel=0.03)  # noise by blocks
 
 
 @pytest.mark.parametrize("sigma", [0.3, 1.0, 2.7])

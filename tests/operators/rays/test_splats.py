@@ -13,7 +13,7 @@ from variants import each_value
 import clrecon
 from clrecon.errors import DeviceError, UsageError
 from clrecon.operators.rays.picture_buffers import Shot
-from clrecon.operators.rays.point_pictures import MOST_NAMED, Discs, PointPictures, cloud_box, draw_splats
+from clrecon.operators.rays.point_pictures import LARGEST_DISC, MOST_NAMED, Discs, PointPictures, cloud_box, draw_splats
 from clrecon.points import PointCloud
 from clrecon.proof.rays.objects import find_splats, shade_splats
 from clrecon.rendering import UNSHADED, Lighting
@@ -26,12 +26,12 @@ FRONT = Camera((0.0, -50.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), parallel_sca
 """Half a mm a pixel, y into the picture."""
 
 
-def ball(count: int = 3000, radius: float = 8.0, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """Return points on a ball with some noise, and unit normals."""
-    rng = np.random.default_rng(seed)
+def ball(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return points on a ball of 8 mm with some noise, and unit normals."""
+    rng = np.random.default_rng(1)
     normals = rng.normal(size=(count, 3))
     normals /= np.linalg.norm(normals, axis=1)[:, None]
-    return (normals * (radius + rng.normal(0.0, 0.1, (count, 1)))).astype(np.float32), normals.astype(np.float32)
+    return (normals * (8.0 + rng.normal(0.0, 0.1, (count, 1)))).astype(np.float32), normals.astype(np.float32)
 
 
 CAMERAS = {
@@ -57,7 +57,7 @@ def test_every_pixel_shows_the_point_and_depth_of_the_twin(device: Any, name: st
     )
     assert np.array_equal(shown, numbers)
     assert np.array_equal(np.isnan(found.depth), numbers < 0)
-    expected = shade_splats(depth, numbers, colors[:, :3] / 255.0, None, camera, UNSHADED, 1)[1]
+    _, expected = shade_splats(depth, numbers, colors[:, :3] / 255.0, None, camera, UNSHADED, 1)
     assert np.allclose(found.depth, expected, rtol=0.0, atol=tolerances.SPLAT_DEPTH_MM, equal_nan=True)
 
 
@@ -66,7 +66,7 @@ def test_every_pixel_shows_the_point_and_depth_of_the_twin(device: Any, name: st
     "lighting",
     [
         pytest.param(Lighting(), marks=pytest.mark.oclgrind),
-        Lighting(0.1, 0.7, 0.5, 20.5, direction=(0.4, -1.0, 0.8)),
+        Lighting(ambient=0.1, diffuse=0.7, specular=0.5, specular_power=20.5, direction=(0.4, -1.0, 0.8)),
         UNSHADED,
     ],
 )
@@ -76,11 +76,11 @@ def test_light_of_points_is_that_of_the_twin(device: Any, has_normals: bool, lig
     rng = np.random.default_rng(3)
     colors = rng.integers(0, 256, (len(points), 4)).astype(np.uint8)
     normals[::50] = 0.0  # no direction: full diffuse light
-    own = normals if has_normals else None
+    own, radius_mm = normals if has_normals else None, 0.6
     for camera in (CAMERAS["parallel"], CAMERAS["perspective"]):
-        found = draw_splats(device, Discs(points, colors, own, 0.6, lighting), Shot(camera, SIZE, "navy"))
-        depth, numbers = find_splats(points, camera, SIZE, 0.6)
-        apart = int(np.clip(round(0.6 / camera.pixel_mm(SIZE)), 1, 8))
+        found = draw_splats(device, Discs(points, colors, own, radius_mm, lighting), Shot(camera, SIZE, "navy"))
+        depth, numbers = find_splats(points, camera, SIZE, radius_mm)
+        apart = int(np.clip(round(radius_mm / camera.pixel_mm(SIZE)), 1, 8))
         rgba, _ = shade_splats(depth, numbers, colors[:, :3] / 255.0, own, camera, lighting, apart)
         image = np.where(rgba[..., 3:] > 0.0, 255.0 * rgba[..., :3], (0.0, 0.0, 128.0))  # navy
         assert np.abs(found.image[..., :3] - image).max() <= tolerances.SPLAT_COLOR_LEVELS
@@ -110,18 +110,20 @@ def test_disc_of_a_point_covers_its_radius_and_hides_farther_ones(two_discs: Any
 def test_first_of_points_in_one_place_is_seen_in_the_colour_of_the_legend(two_discs: Any) -> None:
     picture, _, _ = two_discs
     color_of = {entry["label"]: entry["color"] for entry in picture.report["legend"]}
-    middle, right = picture.image[23, 47, :3], picture.image[23, 55, :3]
+    middle, right = picture.image[23, 47, :3], picture.image[23, 55, :3]  # of 47 x 95 pixels; 4 mm to the right
     assert "#" + middle.tobytes().hex() == color_of[3]
     assert "#" + right.tobytes().hex() == color_of[1]
 
 
 def test_legend_counts_the_points_of_each_label(two_discs: Any) -> None:
-    assert [entry["points"] for entry in two_discs[0].report["legend"]] == [1, 1, 1, 1]
+    picture, _, _ = two_discs
+    assert [entry["points"] for entry in picture.report["legend"]] == [1, 1, 1, 1]
 
 
 def test_picture_of_points_has_one_depth_and_no_values(two_discs: Any) -> None:
-    assert two_discs[0].expected_depth is two_discs[0].depth
-    assert two_discs[0].values is None
+    picture, _, _ = two_discs
+    assert picture.expected_depth is picture.depth
+    assert picture.values is None
 
 
 def test_points_smaller_than_a_pixel_are_seen(device: Any) -> None:
@@ -142,10 +144,12 @@ def many_discs(request: pytest.FixtureRequest) -> Any:
     points, normals = ball(MANY)
     colors = np.full((MANY, 4), 255, np.uint8)
     colors[:, 0] = np.arange(MANY) % 256
-    return Discs(points, colors, normals, 0.5, Lighting()), Shot(CAMERAS[request.param], SIZE)
+    discs = Discs(points, colors, normals, radius_mm=0.5, lighting=Lighting())
+    return discs, Shot(CAMERAS[request.param], SIZE)
 
 
-PICTURE_BYTES, POINT_BYTES = 16 * SIZE[0] * SIZE[1], 28
+PICTURE_BYTES = 16 * SIZE[0] * SIZE[1]
+POINT_BYTES = 3 * 4 + 4 + 3 * 4  # place, colour and normal
 
 
 def test_points_in_parts_give_the_same_picture_and_progress_after_each(device: Any, many_discs: Any) -> None:
@@ -164,12 +168,9 @@ def test_points_in_parts_give_the_same_picture_and_progress_after_each(device: A
 
 def test_permuted_points_give_the_same_picture(device: Any, many_discs: Any) -> None:
     discs, shot = many_discs
-    points, normals = ball(MANY)
     order = np.random.default_rng(5).permutation(MANY)
-    colors = np.full((MANY, 4), 255, np.uint8)
-    colors[:, 0] = np.arange(MANY) % 256
-    permuted = draw_splats(device, Discs(points[order], colors[order], normals[order], 0.5, Lighting()), shot)
-    assert permuted.image.tobytes() == draw_splats(device, discs, shot).image.tobytes()
+    shuffled = discs._replace(points=discs.points[order], colors=discs.colors[order], normals=discs.normals[order])
+    assert draw_splats(device, shuffled, shot).image.tobytes() == draw_splats(device, discs, shot).image.tobytes()
 
 
 def test_points_without_room_beside_their_picture_are_refused(device: Any, many_discs: Any) -> None:
@@ -179,7 +180,7 @@ def test_points_without_room_beside_their_picture_are_refused(device: Any, many_
 
 
 def test_a_cloud_far_from_the_origin_looks_the_same(device: Any) -> None:
-    points, normals = ball()
+    points, normals = ball(3000)
     near = clrecon.render(PointCloud(points, normals), size=SIZE, view=(20, 30), radius_mm=0.5, device=device)
     away = PointCloud(points.astype(np.float64) + 1e5, normals)
     assert away.points.dtype == np.float64
@@ -195,7 +196,8 @@ def colors_of_four(device: Any, **look: Any) -> tuple[list[tuple[int, ...]], dic
     cloud = PointCloud(FOUR, hu=[0, 100, 200, 300], labels=[-1, 0, 2, 0], report={"label_names": {2: "sheet"}})
     own = PointLook(radius_mm=1.0, lighting=UNSHADED, **look)
     picture = clrecon.render(cloud, own, camera=FRONT, size=(47, 47), device=device)
-    return [tuple(picture.image[23, at, :3].tolist()) for at in (11, 19, 27, 35)], picture.report
+    middle_row, columns = 23, 23 + 2 * FOUR[:, 0].astype(int)  # of 47 x 47 pixels of half a mm
+    return [tuple(picture.image[middle_row, at, :3].tolist()) for at in columns], picture.report
 
 
 def test_points_are_grey_by_their_hu_within_the_window(device: Any) -> None:
@@ -230,7 +232,8 @@ def test_kept_points_are_grey_beside_coloured_removed_ones(device: Any) -> None:
 
 
 def test_points_have_the_one_colour_that_is_given(device: Any) -> None:
-    assert colors_of_four(device, color="red")[0] == [(255, 0, 0)] * 4
+    colors, _ = colors_of_four(device, color="red")
+    assert colors == [(255, 0, 0)] * 4
 
 
 @pytest.mark.parametrize(("hu", "color_by"), [(None, "none"), ([0, 100, 200, 300], "hu")])
@@ -252,7 +255,8 @@ def test_labels_as_far_apart_as_32_bits_are_told_apart(device: Any) -> None:
 
 @pytest.fixture(scope="module")
 def ball_cloud() -> PointCloud:
-    points, normals = ball()
+    """Points on a ball of 8 mm, whose HU are their x."""
+    points, normals = ball(3000)
     return PointCloud(points, normals, hu=points[:, 0])
 
 
@@ -276,7 +280,7 @@ def test_picture_of_a_cloud_that_is_clipped_away_is_its_background(device: Any, 
     "place", [{"view": "left"}, {"view": (20, 30), "view_angle": 40.0}, {"view": "superior", "zoom": 0.5}]
 )
 def test_the_camera_sees_the_whole_cloud(device: Any, place: dict[str, Any]) -> None:
-    points, _ = ball()
+    points, _ = ball(3000)
     camera = clrecon.render(PointCloud(points), size=SIZE, device=device, **place).camera
     pixels, _ = camera.project(points, SIZE)
     assert ((0 < pixels) & (pixels < SIZE)).all()
@@ -292,7 +296,7 @@ def test_a_single_point_is_seen(device: Any) -> None:
     assert np.isfinite(clrecon.render(PointCloud([(1.0, 2.0, 3.0)]), size=SIZE, device=device).depth).any()
 
 
-SMALL_CLOUD = PointCloud(ball(50)[0])
+SMALL_CLOUD = PointCloud(*ball(50))
 
 
 @pytest.mark.parametrize(
@@ -320,10 +324,10 @@ def test_pictures_of_points_with_no_memory_are_refused(device: Any) -> None:
 
 def test_discs_of_few_points_larger_than_are_drawn_are_warned_of(device: Any) -> None:
     near = clrecon.render(SMALL_CLOUD, camera=FRONT, size=(64, 64), radius_mm=80.0, device=device)
-    assert "are drawn with 128" in near.report["warnings"][-1]
+    assert f"are drawn with {LARGEST_DISC:g}" in near.report["warnings"][-1]  # pixels
 
 
 def test_large_discs_of_many_points_are_refused(device: Any) -> None:
-    many = PointCloud(ball(1_400_000)[0])
+    many = PointCloud(*ball(1_400_000))
     with refused(UsageError, "radius", "zoom", 1_400_000):
         clrecon.render(many, camera=FRONT, size=(64, 64), radius_mm=80.0, device=device)

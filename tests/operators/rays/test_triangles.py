@@ -35,15 +35,15 @@ CAMERAS = {
     "inside": Camera((1.0, -3.0, 0.5), (0.0, 5.0, 0.0), (0.1, 0.0, 1.0), view_angle=70.0),
     "inside, parallel": Camera((1.0, -3.0, 0.5), (0.0, 5.0, 0.0), (0.1, 0.0, 1.0), parallel_scale=9.0),
 }
-FIXED = Lighting(0.1, 0.7, 0.5, 20.5, direction=(0.4, -1.0, 0.8))
+FIXED = Lighting(ambient=0.1, diffuse=0.7, specular=0.5, specular_power=20.5, direction=(0.4, -1.0, 0.8))
 
 
 def no_volume(device: Any) -> DrawnVolume:
     """What is drawn beside the triangles."""
-    return DrawnVolume(device, None, 0.0, Stopwatch(), [])
+    return DrawnVolume(device, sample=None, near_mm=0.0, stopwatch=Stopwatch(), warnings=[])
 
 
-def soup(count: int = 150, seed: int = 2) -> Mesh:
+def soup(count: int, *, seed: int = 2) -> Mesh:
     """Return triangles of all sizes anywhere, some without area, some twice."""
     rng = np.random.default_rng(seed)
     middle = rng.uniform(-8.0, 8.0, (count, 1, 3))
@@ -57,7 +57,7 @@ def soup(count: int = 150, seed: int = 2) -> Mesh:
     )
 
 
-def quad(low: float, high: float, y: float) -> Mesh:
+def quad(low: float, high: float, *, y: float) -> Mesh:
     """Return a square across the view of FRONT at depth y + 50, of two triangles."""
     corners = [(low, y, low), (high, y, low), (high, y, high), (low, y, high)]
     return Mesh(corners, [(0, 1, 2), (0, 2, 3)])
@@ -78,7 +78,7 @@ def quad(low: float, high: float, y: float) -> Mesh:
 def test_colour_and_depth_of_opaque_triangles_are_those_of_the_twin(
     device: Any, name: str, lighting: Lighting, flat: bool
 ) -> None:
-    mesh, camera = soup(), CAMERAS[name]
+    mesh, camera = soup(150), CAMERAS[name]
     colors = np.random.default_rng(4).integers(0, 256, (mesh.vertex_count, 3)).astype(np.uint8)
     look = MeshLook(vertex_colors=colors, lighting=lighting, flat=flat)
 
@@ -113,7 +113,7 @@ class TranslucentTriangles:
             shade_layer(meetings, nth_layer(meetings, layer, SIZE), shown, camera, UNSHADED)
             for layer in range(self.most)
         ]
-        self.first_depth = layers[0][1]
+        (_, self.first_depth), *_ = layers
         red, self.opacity, way = np.zeros(SIZE[::-1]), np.zeros(SIZE[::-1]), np.zeros(SIZE[::-1])
         for rgb, depth in layers:
             weight = np.where(np.isnan(depth), 0.0, (1.0 - self.opacity) * opacity)
@@ -126,6 +126,7 @@ class TranslucentTriangles:
 
 @pytest.fixture(params=CAMERAS)
 def translucent(request: pytest.FixtureRequest, device: Any) -> TranslucentTriangles:
+    """Translucent triangles seen by each of the cameras."""
     return TranslucentTriangles(device, CAMERAS[request.param])
 
 
@@ -158,7 +159,7 @@ BALL_RADIUS = 8.0
 @pytest.fixture(params=[False, True], ids=["smooth", "flat"])
 def white_ball(request: pytest.FixtureRequest, device: Any) -> Any:
     """A picture of a ball of triangles, whether they are flat, and the squared height of its sphere at each pixel."""
-    mesh = Mesh(*ball(BALL_RADIUS))
+    mesh = Mesh(*ball(BALL_RADIUS, rings=90))
     picture = clrecon.render(mesh, MeshLook("white", flat=request.param), camera=FRONT, size=(95, 47), device=device)
     x, z = np.meshgrid(0.5 * (np.arange(95) - 47.0), 0.5 * (23.0 - np.arange(47)))
     return picture, request.param, BALL_RADIUS**2 - x * x - z * z
@@ -186,7 +187,7 @@ def test_light_of_a_ball_of_triangles_is_that_of_its_sphere(white_ball: Any) -> 
 def test_report_of_a_mesh_counts_its_triangles(white_ball: Any) -> None:
     picture, _, _ = white_ball
     assert picture.mode == "mesh"
-    assert picture.report["triangles"] == Mesh(*ball(BALL_RADIUS)).triangle_count
+    assert picture.report["triangles"] == Mesh(*ball(BALL_RADIUS, rings=90)).triangle_count
 
 
 REACH = 30.0
@@ -266,13 +267,14 @@ def test_first_of_large_and_small_triangles_and_its_depth_are_those_of_the_twin(
     look = MeshLook(vertex_colors=colors, lighting=UNSHADED)
     found = draw_layers(no_volume(device), [make_part(both, look)], LARGE_SHOT)
     assert np.array_equal(found.image[..., 0] + 256 * found.image[..., 1].astype(int), meetings.triangles[places])
-    along = camera.rays(size)[1] @ camera.basis().forward
+    _, directions = camera.rays(size)
+    along = directions @ camera.basis().forward
     assert np.allclose(found.depth, meetings.depths[places] / along, rtol=tolerances.RAY_LENGTH_SHARE, atol=0.0)
 
 
 @pytest.mark.parametrize(("colors", "seen"), [(["red", "blue"], (255, 0, 0)), (["blue", "red"], (0, 0, 255))])
 def test_of_meshes_in_one_place_the_first_is_seen(device: Any, colors: list[str], seen: tuple[int, int, int]) -> None:
-    parts = [make_part(quad(-20.0, 20.0, 3.0), MeshLook(color, lighting=UNSHADED)) for color in colors]
+    parts = [make_part(quad(-20.0, 20.0, y=3.0), MeshLook(color, lighting=UNSHADED)) for color in colors]
     assert (draw_layers(no_volume(device), parts, Shot(FRONT, (17, 17))).image == (*seen, 255)).all()
 
 
@@ -284,8 +286,8 @@ CLOSE = Camera((0.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), view_angle=90.
 @pytest.mark.parametrize(
     ("mesh", "camera"),
     [
-        pytest.param(quad(100.0, 120.0, 0.0), FRONT, id="beside"),
-        pytest.param(quad(-9.0, 9.0, -5.0), CLOSE, id="behind"),
+        pytest.param(quad(100.0, 120.0, y=0.0), FRONT, id="beside"),
+        pytest.param(quad(-9.0, 9.0, y=-5.0), CLOSE, id="behind"),
     ],
 )
 def test_triangles_beside_or_behind_the_camera_are_not_seen(device: Any, mesh: Mesh, camera: Camera) -> None:
@@ -300,19 +302,19 @@ def test_a_floor_that_reaches_behind_the_camera_is_seen_before_it_alone(device: 
     # surely within the triangle, whose half width at y = 100 is 50 * (200 - 100) / 210 = 23.8 mm
     hit = (way > 0.0) & (directions[..., 1] * way < 100.0) & (np.abs(directions[..., 0] * way) < 20.0)
     assert np.allclose(picture.depth[hit], way[hit], rtol=1e-5)  # float32: a division by a slope of 0.01
-    assert np.isnan(picture.depth[:30]).all()  # above the horizon
+    assert np.isnan(picture.depth[:30]).all()  # of 60 rows: above the horizon
 
 
 def test_a_picture_of_one_pixel_shows_the_triangle_there(device: Any) -> None:
-    picture = clrecon.render(quad(-9.0, 9.0, 3.0), WHITE, camera=FRONT, size=(1, 1), device=device)
+    picture = clrecon.render(quad(-9.0, 9.0, y=3.0), WHITE, camera=FRONT, size=(1, 1), device=device)
     assert picture.image.tolist() == [[[255, 255, 255, 255]]]
-    assert picture.depth[0, 0] == 53.0
+    assert picture.depth.tolist() == [[50.0 + 3.0]]
 
 
 def test_a_clipped_square_is_seen_where_it_is_kept(device: Any) -> None:
     """The planes meet the square in x = 2.25 and z = -1.25; its sides are at 9.1."""
     clip = Clip.plane((2.25, 3.0, 0.0), (0.6, 0.8, 0.0)) & Clip.plane((0.0, 3.0, -1.25), (0.0, 0.6, 0.8))
-    picture = clrecon.render(quad(-9.1, 9.1, 3.0), MeshLook(clip=clip), camera=FRONT, size=SIZE, device=device)
+    picture = clrecon.render(quad(-9.1, 9.1, y=3.0), MeshLook(clip=clip), camera=FRONT, size=SIZE, device=device)
     columns, rows = np.arange(SIZE[0]), np.arange(SIZE[1])
     x, z = 0.5 * (columns - 30), 0.5 * (23 - rows)  # centres of pixels, half a mm apart
     kept = ((z > -1.25) & (z < 9.1))[:, None] & ((x > 2.25) & (x < 9.1))
@@ -323,7 +325,7 @@ def test_a_clipped_square_is_seen_where_it_is_kept(device: Any) -> None:
 @pytest.mark.seconds
 @pytest.mark.parametrize("name", ["parallel", "perspective"])
 def test_clipped_balls_show_what_is_kept_and_nothing_else(device: Any, name: str) -> None:
-    mesh, camera = Mesh(*ball(8.0, 30)), CAMERAS[name]
+    mesh, camera = Mesh(*ball(radius=8.0, rings=30)), CAMERAS[name]
     clip = Clip.plane((0.0, 0.0, 1.0), (0.2, 0.3, -1.0)) & Clip.plane((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0))
     picture = clrecon.render(mesh, MeshLook(clip=clip), camera=camera, size=SIZE, device=device)
     seen = ~np.isnan(picture.depth)
@@ -358,16 +360,15 @@ def test_bytes_a_pixel_are_those_of_the_buffers(device: Any, monkeypatch: pytest
     def bytes_of(width: int, height: int) -> int:
         taken.clear()
         still = Still(np.zeros((height, width, 4), np.uint8), np.zeros((height, width), np.float32))
-        draw_layers(
-            no_volume(device), [make_part(quad(-9.0, 9.0, 3.0), MeshLook())], Shot(FRONT, (width, height)), still=still
-        )
+        square = make_part(quad(-9.0, 9.0, y=3.0), MeshLook())
+        draw_layers(no_volume(device), [square], Shot(FRONT, (width, height)), still=still)
         return sum(taken)
 
     assert bytes_of(61, 47) - bytes_of(11, 47) == PIXEL_BYTES * 50 * 47
 
 
 def test_a_mesh_far_away_looks_the_same(device: Any) -> None:
-    mesh = Mesh(*ball(8.0))
+    mesh = Mesh(*ball(radius=8.0))
     near = clrecon.render(mesh, size=SIZE, view=(20, 30), device=device)
     away = Mesh(mesh.vertices.astype(np.float64) + 1e5, mesh.triangles)
     assert away.vertices.dtype == np.float64
@@ -376,7 +377,7 @@ def test_a_mesh_far_away_looks_the_same(device: Any) -> None:
 
 
 def test_layers_beyond_the_most_are_left_out_and_the_report_warns_of_their_pixels(device: Any) -> None:
-    sheets = [quad(-30.0, 30.0, float(n)) for n in range(LAYERS + 3)]
+    sheets = [quad(-30.0, 30.0, y=float(n)) for n in range(LAYERS + 3)]
     mesh = Mesh(
         np.concatenate([sheet.vertices for sheet in sheets]),
         np.concatenate([sheet.triangles + 4 * n for n, sheet in enumerate(sheets)]),
@@ -417,7 +418,7 @@ def test_triangles_whose_numbers_need_more_than_32_bits_are_refused() -> None:
 
 def test_a_mesh_drawn_as_a_volume_is_refused(device: Any) -> None:
     with pytest.raises(UsageError, match="mode mesh"):
-        clrecon.render(quad(-9.0, 9.0, 3.0), "dvr", device=device)
+        clrecon.render(quad(-9.0, 9.0, y=3.0), "dvr", device=device)
 
 
 def test_a_volume_drawn_as_a_mesh_is_refused(device: Any) -> None:
@@ -427,7 +428,7 @@ def test_a_volume_drawn_as_a_mesh_is_refused(device: Any) -> None:
 
 def test_fewer_colours_than_vertices_are_refused(device: Any) -> None:
     with refused(UsageError, 3, 4):
-        clrecon.render(quad(-9.0, 9.0, 3.0), MeshLook(vertex_colors=np.zeros((3, 3))), device=device)
+        clrecon.render(quad(-9.0, 9.0, y=3.0), MeshLook(vertex_colors=np.zeros((3, 3))), device=device)
 
 
 @pytest.mark.parametrize(
@@ -452,10 +453,10 @@ def test_a_mesh_without_opacity_is_refused() -> None:
 
 def test_a_mesh_beyond_the_memory_is_refused(device: Any) -> None:
     with refused(DeviceError, "triangles"):
-        clrecon.render(quad(-9.0, 9.0, 3.0), size=SIZE, memory=1000, device=device)
+        clrecon.render(quad(-9.0, 9.0, y=3.0), size=SIZE, memory=1000, device=device)
 
 
 def test_a_picture_with_too_many_pieces_of_triangles_is_refused(device: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("clrecon.operators.rays.mesh_pictures.MOST_PIECES", 5)
     with pytest.raises(UsageError, match="take a smaller picture"):
-        clrecon.render(quad(-9.0, 9.0, 3.0), camera=FRONT, size=(200, 200), device=device)
+        clrecon.render(quad(-9.0, 9.0, y=3.0), camera=FRONT, size=(200, 200), device=device)
