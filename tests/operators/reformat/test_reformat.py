@@ -26,24 +26,24 @@ SHEARED[:3, :3] = rotation((15.0, -25.0, 40.0)) @ [[0.7, 0.0, 0.1], [0.0, 0.5, -
 SHEARED[:3, 3] = (-120.0, 80.0, -700.0)
 
 
-def random_voxels(shape, dtype="int16", seed=1):
+def random_voxels(shape, dtype="int16"):
     """Values of 0 to 99 HU."""
-    values = np.random.default_rng(seed).integers(0, 100, shape)
-    return values.astype(dtype)
+    return np.random.default_rng(1).integers(0, 100, shape).astype(dtype)
 
 
 def camera_of_slice(volume, k) -> Camera:
     """Pixel = voxel: looking along the slices' normal at slice k, rows to the right and columns downwards."""
     ni, nj, _ = volume.shape_ijk
     i_step, j_step = volume.affine[:3, 0], volume.affine[:3, 1]
-    middle = volume.ijk_to_lps([((ni - 1) / 2, (nj - 1) / 2, k)])[0]
+    (middle,) = volume.ijk_to_lps([((ni - 1) / 2, (nj - 1) / 2, k)])
     normal = np.cross(i_step, j_step)
     assert abs(i_step @ j_step) < 1e-9 and np.isclose(np.linalg.norm(i_step), np.linalg.norm(j_step))
     scale = 0.5 * nj * float(np.linalg.norm(j_step))
     return Camera(tuple(middle - normal), tuple(middle), tuple(-j_step), parallel_scale=scale)
 
 
-def even_volume(dtype="int16", angles=(0.0, 0.0, 0.0), spacing=(0.7, 0.7, 2.5), shape=(6, 8, 11), shear=0.0):
+def even_volume(*, dtype="int16", angles=(0.0, 0.0, 0.0), spacing=(0.7, 0.7, 2.5), shape=(6, 8, 11), shear=0.0):
+    """Random HU in slices, rows and columns of a turned grid; slices lie aside along columns by `shear` of a step."""
     affine = np.eye(4)
     affine[:3, :3] = rotation(angles) * spacing
     affine[:3, 2] += shear * affine[:3, 1]
@@ -55,8 +55,8 @@ def even_volume(dtype="int16", angles=(0.0, 0.0, 0.0), spacing=(0.7, 0.7, 2.5), 
 @pytest.mark.parametrize("angles", [(0.0, 0.0, 0.0), (20.0, -35.0, 10.0)])
 @pytest.mark.parametrize("shear", [0.0, 0.8])
 def test_pixel_on_a_voxel_has_its_value(device, dtype, angles, shear):
-    volume = even_volume(dtype, angles, shear=shear)
-    cuts = [cut_slice(volume, camera_of_slice(volume, k), (11, 8), device=device) for k in range(6)]
+    volume = even_volume(dtype=dtype, angles=angles, shape=(6, 8, 11), shear=shear)
+    cuts = [cut_slice(volume, camera_of_slice(volume, k), size=(11, 8), device=device) for k in range(6)]
     assert np.array_equal([cut.values for cut in cuts], volume.voxels.astype(np.float32))
 
 
@@ -80,7 +80,7 @@ def test_planes_of_anatomy_show_left_at_the_right_front_at_the_top_or_left_and_h
 ):
     """The axes of the volume are those of the patient: i to the left, j to the back, k to the head."""
     volume = Volume(random_voxels((6, 8, 12)), np.eye(4))
-    voxel = volume.ijk_to_lps([(6.0, 4.0, 3.0)])[0]  # beside the middle: pixels lie on voxels
+    (voxel,) = volume.ijk_to_lps([(6.0, 4.0, 3.0)])  # beside the middle: pixels lie on voxels
     camera = find_plane(volume, plane, size, pixel_mm=1.0)
     shift = float((voxel - camera.focal_point) @ camera.basis().forward)
     cut = cut_slice(volume, plane, size, device=device, pixel_mm=1.0, offset_mm=shift)
@@ -179,25 +179,26 @@ def uneven_aside(voxels) -> Volume:
 def test_an_oblique_slice_equals_that_of_simpleitk(device):
     """A third opinion: the same plane through the same grid, between the outer voxel centres."""
     sitk = pytest.importorskip("SimpleITK")
-    volume = even_volume("float32", (20.0, -35.0, 10.0), (0.7, 0.5, 2.5), (12, 14, 16))
+    volume = even_volume(dtype="float32", angles=(20.0, -35.0, 10.0), spacing=(0.7, 0.5, 2.5), shape=(12, 14, 16))
     grid = sitk.GetImageFromArray(volume.voxels)
     grid.SetSpacing(volume.spacing)
     grid.SetOrigin(volume.affine[:3, 3].tolist())
     grid.SetDirection((volume.affine[:3, :3] / volume.spacing).ravel().tolist())
-    cut = cut_slice(volume, (25.0, 40.0), (60, 50), device=device, zoom=1.5, offset_mm=0.7)
+    size = columns, rows = 60, 50
+    cut = cut_slice(volume, (25.0, 40.0), size, device=device, zoom=1.5, offset_mm=0.7)
     right, up, forward = cut.camera.basis()
     pixel = cut.report["pixel_mm"]
-    first = cut.camera.focal_point + pixel * (-29.5 * right + 24.5 * up)
+    first = cut.camera.focal_point + pixel * (-(columns - 1) / 2 * right + (rows - 1) / 2 * up)
     resampler = sitk.ResampleImageFilter()
-    resampler.SetSize((60, 50, 1))
+    resampler.SetSize((columns, rows, 1))
     resampler.SetOutputSpacing((pixel, pixel, 1.0))
     resampler.SetOutputOrigin(first.tolist())
     resampler.SetOutputDirection(np.stack([right, -up, forward], axis=1).ravel().tolist())
     resampler.SetInterpolator(sitk.sitkLinear)
     resampler.SetDefaultPixelValue(np.nan)
-    other = sitk.GetArrayFromImage(resampler.Execute(grid))[0]
-    origins, directions = cut.camera.rays((60, 50))
-    ijk = volume.lps_to_ijk((origins + cut.camera.distance * directions).reshape(-1, 3)).reshape(50, 60, 3)
+    (other,) = sitk.GetArrayFromImage(resampler.Execute(grid))
+    origins, directions = cut.camera.rays(size)
+    ijk = volume.lps_to_ijk((origins + cut.camera.distance * directions).reshape(-1, 3)).reshape(rows, columns, 3)
     within = ((ijk >= 0.0) & (ijk <= (15, 13, 11))).all(axis=2)
     assert within.sum() > 300  # pixels; measured 1112
     assert np.abs(cut.values - other)[within].max() <= tolerances.TWIN_SLICE_HU
@@ -207,7 +208,7 @@ VOLUMES = {
     "sheared": lambda dtype: Volume(random_voxels((9, 7, 11), dtype), SHEARED),
     "uneven": lambda dtype: uneven(random_voxels((6, 5, 4), dtype)),
     "uneven aside": lambda dtype: uneven_aside(random_voxels((6, 5, 4), dtype)),
-    "uneven downwards": lambda dtype: uneven(random_voxels((6, 5, 4), dtype), -1.0),
+    "uneven downwards": lambda dtype: uneven(random_voxels((6, 5, 4), dtype), sign=-1.0),
     "one slice": lambda dtype: Volume(random_voxels((1, 5, 4), dtype), SHEARED),
     "one voxel": lambda dtype: Volume(random_voxels((1, 1, 1), dtype), SHEARED),
 }
@@ -226,17 +227,18 @@ def test_reformation_equals_its_twin(device, name, dtype):
     volume = VOLUMES[name](dtype)
     for view, thickness, combine in [("axial", 0.0, "mean"), ((20.0, 30.0), 2.3, "max"), ("sagittal", 7.0, "mean"),
                                      ((-75.0, 10.0), 3.0, "min")]:  # fmt: skip
-        sheet, _ = plane_sheet(find_plane(volume, view, (31, 33)), (31, 33), 0.1)
+        size = (31, 33)
+        sheet, _ = plane_sheet(find_plane(volume, view, size), size, offset_mm=0.1)
         samples = slab_samples(volume, thickness)
-        made = sample_sheet(DeviceVolume(volume, device=device), sheet, samples, combine)
-        assert_values_are_near(made.values, reformat_sheet(volume, sheet, samples, combine))
+        sampled = sample_sheet(DeviceVolume(volume, device=device), sheet, samples, combine)
+        assert_values_are_near(sampled.values, reformat_sheet(volume, sheet, samples, combine))
 
 
 class SlabCase:
-    """An oblique sheet through a volume, sampled whole and with memory for a few slices only."""
+    """An oblique sheet through one of `VOLUMES`, sampled whole and with memory for a few slices only."""
 
-    def __init__(self, device, name, samples):
-        self.device, self.samples = device, samples
+    def __init__(self, device, name, *, combine, thickness):
+        self.device, self.combine, self.thickness = device, combine, thickness
         self.volume = VOLUMES[name]("float32")
         self.sheet, _ = plane_sheet(find_plane(self.volume, (20.0, 30.0), (23, 17)), (23, 17))
         self.whole = sample_sheet(DeviceVolume(self.volume, device=device), self.sheet, *self._combined())
@@ -244,8 +246,7 @@ class SlabCase:
         assert self.whole.slices >= 4  # or there is nothing to split
 
     def _combined(self):
-        combine, thickness = self.samples
-        return slab_samples(self.volume, thickness), combine
+        return slab_samples(self.volume, self.thickness), self.combine
 
     def sample_with(self, slices, less=0):
         """Sample with memory for these slices and what the whole needed beside its slices, less some bytes."""
@@ -257,38 +258,38 @@ class SlabCase:
         return reformat_sheet(self.volume, self.sheet, *self._combined())
 
 
-ODD_VOLUMES = ["sheared", "uneven aside", "uneven downwards"]
+odd_volumes = pytest.mark.parametrize("name", ["sheared", "uneven aside", "uneven downwards"])
 
 
-@pytest.fixture(params=ODD_VOLUMES)
-def odd_volume(request):
-    return request.param
-
-
-@pytest.mark.parametrize("samples", [("mean", 0.0), ("max", 3.0), ("min", 3.0)])
+@odd_volumes
+@pytest.mark.parametrize(("combine", "thickness"), [("mean", 0.0), ("max", 3.0), ("min", 3.0)])
 @pytest.mark.parametrize("slices", [2, 3, 4])
-def test_volumes_that_do_not_fit_give_the_same_values_in_slabs(device, odd_volume, samples, slices):
-    case = SlabCase(device, odd_volume, samples)
+def test_volumes_that_do_not_fit_give_the_same_values_in_slabs(device, name, combine, thickness, slices):
+    case = SlabCase(device, name, combine=combine, thickness=thickness)
     parts = case.sample_with(slices)
     assert parts.slabs == 1 + -(-(case.whole.slices - slices) // (slices - 1))  # neighbours share a slice
     assert np.array_equal(parts.values, case.whole.values, equal_nan=True)
 
 
-def test_means_of_thick_slabs_in_parts_are_those_of_the_twin(device, odd_volume):
-    case = SlabCase(device, odd_volume, ("mean", 5.0))
-    assert_values_are_near(case.sample_with(2).values, case.twin())
+@odd_volumes
+def test_means_of_thick_slabs_in_parts_are_those_of_the_twin(device, name):
+    case = SlabCase(device, name, combine="mean", thickness=5.0)
+    assert_values_are_near(case.sample_with(slices=2).values, case.twin())
 
 
-def test_memory_for_less_than_two_slices_is_refused(device, odd_volume):
-    case = SlabCase(device, odd_volume, ("mean", 0.0))
+@odd_volumes
+def test_memory_for_less_than_two_slices_is_refused(device, name):
+    case = SlabCase(device, name, combine="mean", thickness=0.0)
     with refused(DeviceError, "slices"):
-        case.sample_with(2, less=1)
+        case.sample_with(slices=2, less=1)
 
 
 def test_only_slices_that_are_met_are_taken(device):
-    volume = Volume(random_voxels((50, 8, 8)), np.eye(4))  # 6,400 bytes
-    cut = cut_slice(volume, "axial", (8, 8), device=device, pixel_mm=1.0, memory=8000)
-    assert cut.report["device_bytes"] <= 8000 and cut.report["slabs"] == 1  # measured 1,392 bytes
+    volume = Volume(random_voxels((50, 8, 8)), np.eye(4))
+    cut = cut_slice(volume, "axial", (8, 8), device=device, pixel_mm=1.0)
+    two_slices, picture_bytes = 2 * volume.voxels[0].nbytes, 2000  # measured 1,136
+    assert cut.report["device_bytes"] <= two_slices + picture_bytes < volume.voxels.nbytes
+    assert cut.report["slabs"] == 1
 
 
 def test_a_volume_on_the_device_is_not_copied_again_and_gives_the_same_values(device):
@@ -296,9 +297,9 @@ def test_a_volume_on_the_device_is_not_copied_again_and_gives_the_same_values(de
     expected = cut_slice(volume, (20.0, 30.0), (31, 20), device=device, thickness=2.0)
     with DeviceVolume(volume, device=device) as resident:
         resident.whole(Stopwatch())
-        made = cut_slice(resident, (20.0, 30.0), (31, 20), thickness=2.0)
+        cut = cut_slice(resident, (20.0, 30.0), (31, 20), thickness=2.0)
         assert resident.uploaded_bytes == volume.voxels.nbytes
-    assert np.array_equal(made.values, expected.values, equal_nan=True)
+    assert np.array_equal(cut.values, expected.values, equal_nan=True)
 
 
 def test_grey_runs_from_black_to_white_over_the_window(device):
@@ -344,8 +345,8 @@ def test_slices_stay_within_their_buffers(device, name):
     volume = VOLUMES[name]("int16")
     sheet, _ = plane_sheet(find_plane(volume, (20.0, 30.0), (9, 8)), (9, 8))
     samples = slab_samples(volume, 2.0)
-    made = sample_sheet(DeviceVolume(volume, device=device), sheet, samples, "mean")
-    assert_values_are_near(made.values, reformat_sheet(volume, sheet, samples, "mean"))
+    sampled = sample_sheet(DeviceVolume(volume, device=device), sheet, samples, "mean")
+    assert_values_are_near(sampled.values, reformat_sheet(volume, sheet, samples, "mean"))
 
 
 @pytest.mark.oclgrind

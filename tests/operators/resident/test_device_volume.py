@@ -23,11 +23,13 @@ from clrecon.operators.resident.device_volume import DeviceVolume
 
 @pytest.fixture(scope="module")
 def volume():
+    """Smooth noise about 0 HU in 22 slices."""
     return smooth_volume((22, 26, 45))
 
 
 @pytest.fixture(scope="module")
 def labels(volume):
+    """Two boxes that touch: label 1 below label 2."""
     return label_boxes(volume, np.s_[3:12, 4:20, 5:30], np.s_[12:20, 4:20, 5:30])
 
 
@@ -36,6 +38,7 @@ PICTURES = {"dvr", "dvr labels", "ray surface", "drr", "slices"}
 
 
 def assert_equal(found, expected, work: str) -> None:
+    """Arrays of a result are those expected to the bit, or, of `PICTURES`, but for rounding."""
     for one, other in zip(found, expected, strict=True):
         if work in PICTURES and one.dtype == np.uint8:
             assert np.abs(one.astype(int) - other.astype(int)).max() <= tolerances.RAY_SAME_255
@@ -79,7 +82,7 @@ def test_a_buffer_that_fails_is_warned_of_with_the_slabs_that_follow(device, vol
 @pytest.mark.parametrize("work", WORK)
 def test_a_device_without_any_room_is_refused_and_holds_nothing(device, volume, labels, monkeypatch, work):
     with DeviceVolume(volume, device=device) as resident:
-        Failing(monkeypatch, "buffer", 1, 10**6)
+        Failing(monkeypatch, "buffer", first=1, last=10**6)
         with refused(DeviceError, "bytes", "injected"):
             WORK[work](resident, labels)
         assert resident.uploaded_bytes == 0
@@ -133,12 +136,12 @@ def test_a_turntable_of_labels_brings_the_map_to_the_grid_once(device, volume, m
 
 def test_kept_buffers_make_room_for_a_surface_after_a_picture(device, volume):
     """Enough memory for any of them alone, not for what all would like to keep."""
-    voxels = volume.voxels.nbytes
-    with DeviceVolume(volume, device=device, memory=3 * voxels) as resident:
+    voxel_bytes = volume.voxels.nbytes
+    with DeviceVolume(volume, device=device, memory=3 * voxel_bytes) as resident:
         first = clrecon.extract_isosurface(resident, 100)
         clrecon.render(resident, preset="muscle", size=SIZE)
         again = clrecon.extract_isosurface(resident, 100)
-        assert resident.uploaded_bytes >= voxels
+        assert resident.uploaded_bytes >= voxel_bytes
     assert np.array_equal(first.vertices, again.vertices)
 
 
@@ -148,24 +151,24 @@ def test_kept_buffers_count_for_the_mesh_of_another_operator(device, volume):
         needed = sum(clrecon.extract_isosurface(alone, 100).report["device_bytes"].values())
     with DeviceVolume(volume, device=device, memory=needed + 64_000) as resident:
         resident.whole(Stopwatch())
-        resident.keep("made up", None, 200_000, object)
+        resident.keep("of ray pictures", None, 200_000, object)
         mesh = clrecon.extract_isosurface(resident, 100)
         assert mesh.report["slabs"] == 1
         assert not mesh.report["warnings"]
-        assert resident.kept_bytes("made up") == 0
+        assert resident.kept_bytes("of ray pictures") == 0
 
 
 def test_tables_of_a_transfer_function_stay_from_picture_to_picture_in_slabs(device, volume, monkeypatch):
-    made = []
+    tables = []
     true_of = TransferTables.of
-    monkeypatch.setattr(TransferTables, "of", lambda *which: made.append(1) or true_of(*which))
+    monkeypatch.setattr(TransferTables, "of", lambda *which: tables.append(which) or true_of(*which))
     memory = volume.voxels.nbytes // 2 + 48 * SIZE[0] * SIZE[1]
     with clrecon.VolumeRenderer(volume, device=device, memory=memory) as renderer:
         pictures = [
             renderer.render(preset="muscle", view=(azimuth, 0), size=SIZE, smooth_light=0.0) for azimuth in (0, 30, 60)
         ]
     assert all(picture.report["slabs"] > 1 for picture in pictures)
-    assert len(made) == 1
+    assert len(tables) == 1
 
 
 def test_slices_in_space_keep_to_the_memory_where_the_volume_is_held(device, volume):
@@ -219,10 +222,16 @@ def test_pickling_a_device_volume_is_refused(device, volume):
         pickle.dumps(resident)
 
 
-def test_renderers_and_extractors_leave_a_volume_that_was_given_on_the_device(device, volume):
+def test_an_extractor_leaves_a_volume_that_was_given_on_the_device_until_its_own_end(device, volume):
     with DeviceVolume(volume, device=device) as resident:
         with clrecon.SurfaceExtractor(resident) as extractor:
             extractor.extract(100)
+        assert resident.is_held
+    assert not resident.is_held
+
+
+def test_a_renderer_leaves_a_volume_that_was_given_on_the_device_until_its_own_end(device, volume):
+    with DeviceVolume(volume, device=device) as resident:
         with clrecon.VolumeRenderer(resident) as renderer:
             renderer.render("mip", size=SIZE)
         assert resident.is_held
