@@ -95,7 +95,7 @@ def test_instances_that_are_listed_in_pages_are_all_counted(archive: Archive) ->
 
 def test_list_that_is_the_same_from_any_number_on_ends(archive: Archive) -> None:
     whole = json.dumps([list_entry(uid) for uid in archive.uids]).encode()
-    archive.answers = [answering(whole, "application/dicom+json")] * 2
+    archive.answers = [answering(whole, kind="application/dicom+json")] * 2
 
     assert fetch(archive.url) == SLICES
 
@@ -106,12 +106,12 @@ def test_list_that_is_the_same_from_any_number_on_ends(archive: Archive) -> None
 def cut(handler: Any) -> None:
     """Send half of what was announced."""
     content = join_parts([bytes(100_000)])
-    send(handler, content[:50_000], STORED, Content_Length=str(len(content)))
+    send(handler, content[:50_000], kind=STORED, Content_Length=str(len(content)))
 
 
 def end_early(handler: Any) -> None:
     """Send a body without a length and without its last boundary."""
-    send(handler, join_parts([b"DICM"])[:-9], STORED, Content_Length="")
+    send(handler, join_parts([b"DICM"])[:-9], kind=STORED, Content_Length="")
 
 
 PASSING = {
@@ -165,7 +165,7 @@ def drip(handler: Any) -> None:
     """Send a byte at a time, for ever."""
     from threading import Event
 
-    send(handler, b"", STORED, Content_Length="")
+    send(handler, b"", kind=STORED, Content_Length="")
     while True:
         handler.wfile.write(b"\r")
         Event().wait(0.02)
@@ -193,7 +193,7 @@ def test_other_number_of_instances_than_listed_is_refused_with_it(sent: int, arc
 
 def test_parts_without_an_end_are_refused_where_there_are_more_than_listed(archive: Archive) -> None:
     def send_on(handler: Any) -> None:
-        send(handler, b"", STORED, Content_Length="")
+        send(handler, b"", kind=STORED, Content_Length="")
         while True:
             handler.wfile.write(join_parts([b"DICM"])[: -len(join_parts([]))])
 
@@ -211,24 +211,24 @@ def test_incomplete_series_is_refused_with_both_counts(archive: Archive) -> None
 
 
 def parts_with(border: str) -> Any:
-    return answering(join_parts([b"DICM"]), f'multipart/related; boundary="{border}"')
+    return answering(join_parts([b"DICM"]), kind=f'multipart/related; boundary="{border}"')
 
 
 BAD_ANSWERS = {
-    "page of a login": (answering(b"<html>log in</html>", "text/html"), ("text/html",)),
-    "parts of another kind": (answering(join_parts([b"a"], kind="text/html"), STORED), ("text/html", 1)),
-    "no boundary": (answering(b"", "multipart/related"), ("multipart/related",)),
+    "page of a login": (answering(b"<html>log in</html>", kind="text/html"), ("text/html",)),
+    "parts of another kind": (answering(join_parts([b"a"], kind="text/html"), kind=STORED), ("text/html", 1)),
+    "no boundary": (answering(b"", kind="multipart/related"), ("multipart/related",)),
     "boundary of too many letters": (parts_with("a" * 71), ("multipart/related",)),
-    "boundary that never comes": (answering(bytes(70_000), STORED), (65_536,)),
-    "headers that never end": (answering(join_parts([])[:-4] + bytes(70_000), STORED), (65_536,)),
-    "length of a part too large": (answering(join_parts([b"DICM"], length=5), STORED), (4, 5)),
-    "length of a part too small": (answering(join_parts([b"DICM"], length=3), STORED), (4, 3)),
+    "boundary that never comes": (answering(bytes(70_000), kind=STORED), (65_536,)),
+    "headers that never end": (answering(join_parts([])[:-4] + bytes(70_000), kind=STORED), (65_536,)),
+    "length of a part too large": (answering(join_parts([b"DICM"], length=5), kind=STORED), (4, 5)),
+    "length of a part too small": (answering(join_parts([b"DICM"], length=3), kind=STORED), (4, 3)),
     "length of a part in more digits than Python reads": (
-        answering(join_parts([b"DICM"], length="9" * 5000), STORED),
+        answering(join_parts([b"DICM"], length="9" * 5000), kind=STORED),
         (4,),
     ),
-    "empty part": (answering(join_parts([b""]), STORED), (1, 0)),
-    "packed": (answering(b"", STORED, Content_Encoding="gzip"), ("gzip",)),
+    "empty part": (answering(join_parts([b""]), kind=STORED), (1, 0)),
+    "packed": (answering(b"", kind=STORED, Content_Encoding="gzip"), ("gzip",)),
     "406": (answering(status=406), (406,)),
 }
 
@@ -250,7 +250,7 @@ def test_answer_that_no_try_mends_is_refused_at_once(fault: str, archive: Archiv
     ids=["page", "no list", "no UID", "path", "deep"],
 )
 def test_list_that_is_no_dicom_json_is_refused(content: bytes, archive: Archive) -> None:
-    archive.answers = [answering(content, "application/json")]
+    archive.answers = [answering(content, kind="application/json")]
 
     with refused(RefusedInputError, archive.host, "JSON"):
         read_volume(archive.url)
@@ -263,7 +263,7 @@ def test_more_bytes_than_allowed_are_refused_before_they_arrive(archive: Archive
 
 def test_endless_answer_is_refused_where_it_has_more_bytes_than_allowed(archive: Archive) -> None:
     def send_on(handler: Any) -> None:
-        send(handler, join_parts([])[:-4] + b"\r\n\r\n", STORED, Content_Length="")
+        send(handler, join_parts([])[:-4] + b"\r\n\r\n", kind=STORED, Content_Length="")
         while True:
             handler.wfile.write(bytes(1 << 16))
 
@@ -394,7 +394,7 @@ def test_redirection_on_the_same_host_is_followed_with_credentials(archive: Arch
 def test_redirection_to_another_host_is_followed_without_credentials(
     archive: Archive, elsewhere: Server, netrc: Path
 ) -> None:
-    stored = answering(join_parts(archive.instances), STORED)
+    stored = answering(join_parts(archive.instances), kind=STORED)
     elsewhere.answers = [stored]
     archive.answers = [
         archive.answer,

@@ -183,7 +183,7 @@ def server() -> Iterator[Server]:
 
 
 def test_archive_of_the_web_is_read_as_its_folder(server: Server, packed: bytes, scan: Path) -> None:
-    server.answers = [answering(packed, "application/zip")]
+    server.answers = [answering(packed, kind="application/zip")]
 
     assert_read_as(f"http://{server.host}/a%20scan.zip?key=1", scan)
     assert [path for path, _headers in server.asked] == ["/a%20scan.zip?key=1"]

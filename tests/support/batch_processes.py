@@ -9,6 +9,7 @@ from pathlib import Path
 
 
 def children_of(parent: int) -> list[int]:
+    """Numbers of the processes that a process has started."""
     tasks = Path(f"/proc/{parent}/task")
     return [int(word) for task in tasks.iterdir() for word in (task / "children").read_text().split()]
 

@@ -15,7 +15,8 @@ POCL = {
 }
 
 
-def spread_of(median: float, half: float = 0.1) -> dict[str, float]:
+def spread_of(median: float, *, half: float = 0.1) -> dict[str, float]:
+    """Quartiles `half` below and above a median, and extremes twice as far."""
     return {
         "median": median,
         "q1": median - half,
@@ -25,8 +26,9 @@ def spread_of(median: float, half: float = 0.1) -> dict[str, float]:
     }
 
 
-def make_result(case: str = "isosurface-cold", given: str = "spine149", ratio: float = 2.0) -> dict[str, Any]:
-    side = {"pairs": 5, "clrecon_s": spread_of(0.03, 0.001), "peer_s": spread_of(0.06, 0.001)}
+def make_result(case: str = "isosurface-cold", *, given: str = "spine149", ratio: float = 2.0) -> dict[str, Any]:
+    """A result of a case: clrecon took 30 ms and its peer 60 ms, whatever `ratio` says."""
+    side = {"pairs": 5, "clrecon_s": spread_of(0.03, half=0.001), "peer_s": spread_of(0.06, half=0.001)}
     return {
         "schema": 1,
         "case": case,
@@ -40,14 +42,16 @@ def make_result(case: str = "isosurface-cold", given: str = "spine149", ratio: f
 
 
 def make_scaling_result() -> dict[str, Any]:
+    """A result of four sizes, at each of which clrecon takes a third of the time of its peer."""
+
     def point(number: int) -> dict[str, Any]:
         return {
             "slices": 64 * number,
             "voxels": 10_000_000 * number,
             "triangles": 500_000 * number,
             "hu": 1000.0 - 100 * number,
-            "clrecon_s": spread_of(0.01 * number, 0.001),
-            "peer_s": spread_of(0.03 * number, 0.001),
+            "clrecon_s": spread_of(0.01 * number, half=0.001),
+            "peer_s": spread_of(0.03 * number, half=0.001),
         }
 
     line = {"slope": 1e-9, "intercept": 0.0, "r2": 1.0}

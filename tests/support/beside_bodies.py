@@ -27,12 +27,13 @@ def make_legs() -> tuple[np.ndarray, np.ndarray]:
     return hu, bone
 
 
-def box(centre: tuple[float, float, float], half: tuple[float, float, float], slant: float = 0.0) -> np.ndarray:
+def box(centre: tuple[float, float, float], half: tuple[float, float, float], *, slant: float = 0.0) -> np.ndarray:
     """Mask of a box, mm; its middle moves by `slant` along x for each mm along z."""
     x, y, z = centre
     return (abs(X - x - slant * (Z - z)) < half[0]) & (abs(Y - y) < half[1]) & (abs(Z - z) < half[2])
 
 
 def as_scan(hu: np.ndarray) -> Volume:
+    """The HU with noise of 10 HU, as a scan."""
     noise = np.random.default_rng(1).normal(0, 10, SHAPE)
     return Volume(np.rint(hu + noise).astype(np.int16), AFFINE)

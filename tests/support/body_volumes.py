@@ -39,7 +39,7 @@ def make_patient(*, lungs: bool = False, arms: bool = True, seed: int = 1) -> tu
     return hu + np.random.default_rng(seed).normal(0, 8, SHAPE), patient
 
 
-def add_table(hu: np.ndarray, patient: np.ndarray, gap: float = 6.0) -> np.ndarray:
+def add_table(hu: np.ndarray, patient: np.ndarray, *, gap: float = 6.0) -> np.ndarray:
     """A shell 4 mm thick below the patient, a blanket between, a foam core, a tray further down; returns its mask."""
     table = (abs(Y - (67 + gap)) < 2.2) | (abs(Y - (90 + gap)) < 2.2) | (abs(Y - 140) < 2.2)
     table = (table & (abs(X) < 180)) | ((abs(abs(X) - 180) < 2.2) & (Y > 67 + gap) & (Y < 90 + gap))
@@ -51,4 +51,5 @@ def add_table(hu: np.ndarray, patient: np.ndarray, gap: float = 6.0) -> np.ndarr
 
 
 def as_volume(hu: np.ndarray) -> Volume:
+    """The HU in whole numbers, as a scan."""
     return Volume(np.rint(hu).astype(np.int16), AFFINE)

@@ -74,6 +74,7 @@ def _box(points: np.ndarray, centre: tuple[float, ...], half: tuple[float, ...])
 
 def grid_around(
     vertebra: BoxVertebra,
+    *,
     spacing: tuple[float, float, float] = (0.8, 0.8, 1.0),
     shear: float = 0.0,
     mirrored: bool = False,

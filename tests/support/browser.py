@@ -48,7 +48,7 @@ def open_browser(*flags: str, width: int = 900, height: int = 700) -> Iterator[A
         driver.quit()
 
 
-def wait_for(driver: Any, script: str, seconds: float = SECONDS) -> Any:
+def wait_for(driver: Any, script: str, *, seconds: float = SECONDS) -> Any:
     """Ask a page until it answers with something; fail after a time."""
     end = time.monotonic() + seconds
     while not (found := driver.execute_script(script)):

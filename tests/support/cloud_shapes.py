@@ -12,7 +12,7 @@ from clrecon.proof.points import field as twin
 
 
 def sphere_cloud(
-    n: int = 12_000, radius: float = 20.0, noise: float = 0.0, seed: int = 1, centre: Any = (0.0, 0.0, 0.0)
+    n: int = 12_000, *, radius: float = 20.0, noise: float = 0.0, seed: int = 1, centre: Any = (0.0, 0.0, 0.0)
 ) -> PointCloud:
     """Random points on a sphere; `noise` is the sd in each axis in mm."""
     rng = np.random.default_rng(seed)
@@ -21,7 +21,7 @@ def sphere_cloud(
     return PointCloud(radius * normals + noise * rng.normal(size=(n, 3)) + centre, normals)
 
 
-def cube_cloud(n: int = 13_000, edge: float = 30.0, seed: int = 1) -> PointCloud:
+def cube_cloud(n: int = 13_000, *, edge: float = 30.0, seed: int = 1) -> PointCloud:
     """Random points on the faces of a cube around the origin, axes along x, y, z."""
     rng = np.random.default_rng(seed)
     face, places = rng.integers(0, 6, n), (rng.random((n, 2)) - 0.5) * edge
@@ -32,7 +32,7 @@ def cube_cloud(n: int = 13_000, edge: float = 30.0, seed: int = 1) -> PointCloud
     return PointCloud(points, normals)
 
 
-def cube_distances(points: Any, edge: float = 30.0) -> np.ndarray:
+def cube_distances(points: Any, *, edge: float = 30.0) -> np.ndarray:
     """Signed distance from the surface of that cube."""
     beyond = np.abs(np.asarray(points, float)) - edge / 2
     outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=1)

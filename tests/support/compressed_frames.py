@@ -48,7 +48,7 @@ ENCODERS: dict[str, tuple[str, Callable[[np.ndarray], bytes]]] = {
 }
 
 
-def encode_lossless(image: np.ndarray, predictor: int, bits: int = 16) -> bytes:
+def encode_lossless(image: np.ndarray, predictor: int, *, bits: int = 16) -> bytes:
     return bytes(imagecodecs.jpeg8_encode(image, lossless=True, predictor=predictor, bitspersample=bits))
 
 
@@ -60,14 +60,14 @@ def make_header(folder: Path) -> SliceHeader:
     return headers[0]
 
 
-def place(folder: Path, data: bytes, syntax: str = JPEG + "90", frames: int = 1, **changes: Any) -> list[np.ndarray]:
+def place(folder: Path, data: bytes, syntax: str = JPEG + "90", *, frames: int = 1, **changes: Any) -> list[np.ndarray]:
     """Write bytes as a file of encapsulated pixel data and load its frames."""
     path = folder / "pixels"
     path.write_bytes(data)
-    return load(make_headers(path, syntax, frames, **changes))
+    return load(make_headers(path, syntax, frames=frames, **changes))
 
 
-def make_headers(path: Path, syntax: str, frames: int = 1, **changes: Any) -> list[SliceHeader]:
+def make_headers(path: Path, syntax: str, *, frames: int = 1, **changes: Any) -> list[SliceHeader]:
     """Headers of the frames of a file that holds nothing but encapsulated pixel data."""
     changes = {"rows": ROWS, "columns": COLUMNS, "signed": False, **changes}
     header = dataclasses.replace(
@@ -85,11 +85,13 @@ def make_headers(path: Path, syntax: str, frames: int = 1, **changes: Any) -> li
 
 
 def load(headers: list[SliceHeader]) -> list[np.ndarray]:
+    """The pixels of each header, decoded."""
     with StoredPixels(headers) as source:
         return [source.load(header, np.zeros((header.rows, header.columns), np.int16)) for header in headers]
 
 
 def item(data: bytes) -> bytes:
+    """An item of encapsulated pixel data."""
     return struct.pack("<HHL", 0xFFFE, 0xE000, len(data)) + data
 
 
@@ -97,4 +99,5 @@ END = struct.pack("<HHL", 0xFFFE, 0xE0DD, 0)
 
 
 def even(data: bytes) -> bytes:
+    """The bytes, and one more where their number is odd."""
     return data + b"\0" * (len(data) % 2)

@@ -21,7 +21,7 @@ def make_scan(folder: Path, kind: str) -> tuple[Path, PhantomSettings]:
     return make_once(folder, f"scan-{kind}", lambda path: write_phantom(path, settings)), settings
 
 
-def rescale(slope: float = 1.0, intercept: float = 0.0) -> Callable[[Any], None]:
+def rescale(*, slope: float = 1.0, intercept: float = 0.0) -> Callable[[Any], None]:
     """Change what HU follow: they become `slope` times what they were, plus `intercept`."""
 
     def change(ds: Any) -> None:
@@ -50,8 +50,8 @@ DAMAGES: dict[str, Callable[[Any], None]] = {
     "intercept + 1024": rescale(intercept=1024.0),
     "intercept - 1024": rescale(intercept=-1024.0),
     "intercept + 400": rescale(intercept=400.0),
-    "0.6 of the values + 400": rescale(0.6, 400.0),
-    "half the values": rescale(0.5),
+    "0.6 of the values + 400": rescale(slope=0.6, intercept=400.0),
+    "half the values": rescale(slope=0.5),
     "RescaleType US": without_unit,
     LOST: lambda ds: None,
     BLANK: blank,

@@ -13,6 +13,7 @@ STACK = Plan(shape=(12, 16, 18))
 
 
 def position(k: int) -> list[float]:
+    """Where slice k of `STACK` lies, LPS mm."""
     return [float(value) for value in STACK.position(k)]
 
 
@@ -40,26 +41,33 @@ RESULTS = {
 
 
 def exact(gates: str = "", words: str = "", /, **values: Any) -> Place:
+    """A damage that is read with exact positions; failed gates, a word of the message, elements."""
     return Place("exact", set(gates.split()), words, values)
 
 
 def as_stated(gates: str, words: str, /, **values: Any) -> Place:
+    """A damage that is read as stated and noticed by gates."""
     return Place("as stated", set(gates.split()), words, values)
 
 
 def silent(why: str, /, **values: Any) -> Place:
+    """A damage that is read as stated and that nothing can notice, and why."""
     return Place("silent", set(), why, values)
 
 
 def refused(words: str, /, **values: Any) -> Place:
+    """A damage for which the series is refused."""
     return Place("refused", set(), words, values)
 
 
 def seen(words: str, /, **values: Any) -> Place:
+    """A damage of places that the pictures of a patient show."""
     return Place("as stated", {"shown_places"}, words, values, body=True)
 
 
 def swap(a: int, b: int) -> Any:
+    """Positions of which those of slices a and b are exchanged."""
+
     def swapped(k: int) -> Any:
         return position(b if k == a else a if k == b else k)
 
@@ -82,6 +90,7 @@ def make_patient() -> np.ndarray:
 
 
 def at_one(k: int, odd: Any, usual: Any) -> Any:
+    """A value of slice k, and the usual one of all others."""
     return lambda slice_number: odd if slice_number == k else usual
 
 
@@ -250,6 +259,7 @@ class Row:
 
 
 def stated(gates: str, words: str, plan: Plan | None = None, hu: np.ndarray | None = None, **values: Any) -> Row:
+    """A damage of values that is read as stated; failed gates, and a word of the message."""
     return Row(values, set(gates.split()), words, plan, hu)
 
 

@@ -17,6 +17,7 @@ SIZE = (24, 20)
 
 
 def centre_line(volume: Volume) -> Any:
+    """Six points down the middle of a volume, LPS mm."""
     ni, nj, nk = volume.shape_ijk
     return volume.ijk_to_lps([(ni / 2, nj / 2, k) for k in np.linspace(1, nk - 2, 6)])
 
@@ -30,10 +31,12 @@ def label_boxes(volume: Volume, *boxes: tuple[slice, ...]) -> LabelMap:
 
 
 def values(picture: Rendering) -> list[Any]:
+    """The arrays of a picture."""
     return [picture.image, picture.depth] + ([] if picture.values is None else [picture.values])
 
 
 def mesh_arrays(*meshes: Mesh) -> list[Any]:
+    """The arrays of meshes."""
     return [array for mesh in meshes for array in (mesh.vertices, mesh.triangles, mesh.normals)]
 
 

@@ -82,6 +82,7 @@ class Plan:
 
 
 def make_dataset(plan: Plan, k: int) -> Dataset:
+    """Slice k of a plan."""
     row, column, _ = plan.directions
     ds = Dataset()
     ds.file_meta = FileMetaDataset()
@@ -184,7 +185,7 @@ def write_series(folder: Path, plan: Plan | None = None, change: Change | None =
     return plan
 
 
-def set_raw(keyword: str, text: str, only: int | None = None) -> Change:
+def set_raw(keyword: str, text: str, *, only: int | None = None) -> Change:
     """A change that puts `text` into a text element exactly as it is, past pydicom's checks."""
     from pydicom.datadict import dictionary_VR, tag_for_keyword
     from pydicom.dataelem import RawDataElement
@@ -216,7 +217,7 @@ def write_two_series(folder: Path) -> Path:
     return folder
 
 
-def set_values(only: int | None = None, **values: Any) -> Change:
+def set_values(*, only: int | None = None, **values: Any) -> Change:
     """A change that sets elements by keyword; None deletes."""
 
     def change(ds: Dataset, k: int) -> None:
@@ -230,7 +231,7 @@ def set_values(only: int | None = None, **values: Any) -> Change:
     return change
 
 
-def element_bytes(keyword: str, value: bytes, implicit: bool = False) -> bytes:
+def element_bytes(keyword: str, value: bytes, *, implicit: bool = False) -> bytes:
     """A little-endian element with exactly this value, also where it is odd or no number."""
     from pydicom.datadict import dictionary_VR, tag_for_keyword
 
@@ -240,9 +241,9 @@ def element_bytes(keyword: str, value: bytes, implicit: bool = False) -> bytes:
     return head + (struct.pack("<L", len(value)) if implicit else vr + struct.pack("<H", len(value))) + value
 
 
-def find_element(data: bytes, keyword: str, implicit: bool = False) -> tuple[int, int, int]:
+def find_element(data: bytes, keyword: str, *, implicit: bool = False) -> tuple[int, int, int]:
     """First byte of an element with a short head, of its value, and of what follows."""
-    head = element_bytes(keyword, b"", implicit)[: 4 if implicit else 6]
+    head = element_bytes(keyword, b"", implicit=implicit)[: 4 if implicit else 6]
     assert data.count(head) == 1, f"{keyword} stands {data.count(head)} times in the file"
     start = data.index(head)
     length = struct.unpack_from("<L" if implicit else "<H", data, start + len(head))[0]
@@ -256,8 +257,8 @@ def edit_value(path: Path, keyword: str, change: Callable[[bytes], bytes]) -> No
     path.write_bytes(data[:start] + element_bytes(keyword, change(data[value:end])) + data[end:])
 
 
-def insert_after(path: Path, keyword: str, extra: bytes, implicit: bool = False) -> None:
+def insert_after(path: Path, keyword: str, extra: bytes, *, implicit: bool = False) -> None:
     """Put bytes behind an element of a file."""
     data = path.read_bytes()
-    _, _, end = find_element(data, keyword, implicit)
+    _, _, end = find_element(data, keyword, implicit=implicit)
     path.write_bytes(data[:end] + extra + data[end:])

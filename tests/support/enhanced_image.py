@@ -23,7 +23,7 @@ def _item(**values: object) -> Items:
     return Items([ds])
 
 
-def make_enhanced(plan: Plan, order: Sequence[int] | None = None, slopes: Sequence[int] = (1,)) -> Dataset:
+def make_enhanced(plan: Plan, *, order: Sequence[int] | None = None, slopes: Sequence[int] = (1,)) -> Dataset:
     """Frames in `order` (of k along the normal); slope of slice k is ``slopes[k % len(slopes)]``."""
     order = range(plan.shape[0]) if order is None else order
     frames = [make_dataset(plan, k) for k in order]
@@ -68,6 +68,7 @@ def make_enhanced(plan: Plan, order: Sequence[int] | None = None, slopes: Sequen
 
 
 def save_enhanced(
-    path: Path, plan: Plan, order: Sequence[int] | None = None, slopes: Sequence[int] | None = None
+    path: Path, plan: Plan, *, order: Sequence[int] | None = None, slopes: Sequence[int] | None = None
 ) -> None:
-    save_dataset(make_enhanced(plan, order, slopes or tuple(getattr(plan, "slopes", (1,)))), path)
+    """Write one enhanced image of a plan; see `make_enhanced`."""
+    save_dataset(make_enhanced(plan, order=order, slopes=slopes or tuple(getattr(plan, "slopes", (1,)))), path)

@@ -26,6 +26,7 @@ TOP_LEVEL_OF_SLICES = (
 
 
 def item(**values: Any) -> Dataset:
+    """An item of a sequence with these elements."""
     ds = Dataset()
     for keyword, value in values.items():
         setattr(ds, keyword, value)
@@ -146,7 +147,7 @@ def real_world(slope: float, intercept: float, code: str = "[hnsf'U]") -> Datase
     )
 
 
-def without_rescale(mappings: list[Dataset], kind: str | None = None) -> FileChange:
+def without_rescale(mappings: list[Dataset], *, kind: str | None = None) -> FileChange:
     """A change to real world values: in place of the rescale, or beside one of another type."""
 
     def change(ds: Dataset) -> None:
@@ -160,7 +161,7 @@ def without_rescale(mappings: list[Dataset], kind: str | None = None) -> FileCha
     return change
 
 
-def assert_right(volume: Volume, plan: Plan, hu: np.ndarray | None = None) -> None:
+def assert_right(volume: Volume, plan: Plan, *, hu: np.ndarray | None = None) -> None:
     """Every voxel is where `plan` wrote it, and has its value."""
     nk, nj, ni = plan.shape
     corners = np.array([(i, j, k) for i in (0, ni - 1) for j in (0, nj - 1) for k in range(nk)])

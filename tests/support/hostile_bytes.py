@@ -123,6 +123,7 @@ def _encode(ds: Dataset, syntax: str) -> Dataset:
 
 
 def save_bytes(ds: Dataset) -> bytes:
+    """The bytes of the file of a data set."""
     file = io.BytesIO()
     ds.save_as(file, enforce_file_format=True)
     return file.getvalue()
@@ -169,6 +170,7 @@ def make_phases() -> tuple[bytes, ...]:
 
 @functools.cache
 def phantom_seeds() -> dict[str, Seed]:
+    """Files of small series in each transfer syntax, by name."""
     seeds = {}
     for name, syntax in (NATIVE | COMPRESSED).items():
         files = make_series(syntax)

@@ -23,7 +23,9 @@ TABLE = (
 )
 
 
-def make_labels(shape: Sequence[int] = (4, 6, 7), seed: int = 0, numbers: Sequence[int] = (0, 0, 2, 5)) -> np.ndarray:
+def make_labels(
+    shape: Sequence[int] = (4, 6, 7), *, seed: int = 0, numbers: Sequence[int] = (0, 0, 2, 5)
+) -> np.ndarray:
     """voxels[k, j, i], uint8."""
     return np.random.default_rng(seed).choice(np.array(numbers, np.uint8), shape)
 

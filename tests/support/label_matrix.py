@@ -79,6 +79,8 @@ ROWS: list[Row] = []
 
 
 def add_grid(name: str, verdict: str, words: str, file: Callable[[Path], tuple[Path, np.ndarray, np.ndarray]]) -> None:
+    """Add a row for a label map that `file` writes."""
+
     def write(folder: Path) -> tuple[LabelMap, np.ndarray]:
         path, voxels, _ = file(folder)
         return read_labels(path), voxels
@@ -156,6 +158,7 @@ add_nifti("no voxel with a label", REFUSED, "is empty: no voxel has a label", vo
 
 
 def edit(path: Path, old: bytes, new: bytes) -> Path:
+    """Put new bytes in the place of old ones, where these stand first."""
     content = path.read_bytes()
     assert old in content
     path.write_bytes(content.replace(old, new, 1))
@@ -163,6 +166,7 @@ def edit(path: Path, old: bytes, new: bytes) -> Path:
 
 
 def add_text(name: str, file_name: str, old: bytes, new: bytes, verdict: str, words: str) -> None:
+    """Add a row for a header in text, in which `new` stands in place of `old`."""
     write_file = write_metaimage if ".mh" in file_name else (lambda *args: write_nrrd(*args, encoding="raw"))
 
     def file(folder: Path) -> tuple[Path, np.ndarray, np.ndarray]:
@@ -229,7 +233,8 @@ add_layers("layers without segments", REFUSED, "does not say which segments they
 PLAN = dicom_series.Plan(shape=(6, 8, 9), angles=(10, -20, 35), gap=1.25)
 
 
-def seg_masks(overlap: bool = False, second: int = 1) -> np.ndarray:
+def seg_masks(*, overlap: bool = False, second: int = 1) -> np.ndarray:
+    """Masks (2, 6, 8, 9) of two segments in the first four slices, or in each `second` of them."""
     found = np.zeros((2, 6, 8, 9), bool)
     found[0, 0:4:second, 1:4, 2:7] = True
     found[1, 0:4:second, 3 if overlap else 4 : 7, 3:8] = True
@@ -280,7 +285,7 @@ def unsay(*keywords: str) -> Callable[[Any], None]:
     return change
 
 
-def add_frame(zeros: bool = False, number: int | None = None) -> Callable[[Any], None]:
+def add_frame(*, zeros: bool = False, number: int | None = None) -> Callable[[Any], None]:
     """Append a frame at the place of the first: of no pixels, or all of a number."""
 
     def change(ds: Any) -> None:

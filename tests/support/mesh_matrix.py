@@ -155,7 +155,7 @@ def _ply(path: Path, order: str) -> None:
     path.write_bytes(head + CORNERS.astype(">f8").tobytes() + rows.tobytes())
 
 
-def _obj(path: Path, faces: str, end: str = "\n") -> None:
+def _obj(path: Path, faces: str, *, end: str = "\n") -> None:
     lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in CORNERS.tolist()] + faces.split("\n")
     path.write_bytes((end.join(lines) + end).encode())
 
@@ -164,7 +164,7 @@ PLAIN_FACES = "\n".join(f"f {a + 1} {b + 1} {c + 1}" for a, b, c in FACES)
 BACKWARD_FACES = "\n".join(f"f {a - 4}/-1/-1 {b - 4}/-1/-1 {c - 4}/-1/-1" for a, b, c in FACES)
 
 
-def _threemf(path: Path, unit: str, scale: float, move: np.ndarray | None = None, *, nested: bool = False) -> None:
+def _threemf(path: Path, unit: str, *, scale: float, move: np.ndarray | None = None, nested: bool = False) -> None:
     """Write the body in a unit; with `move`, shape (4, 4), so that a transform brings it to its place."""
     corners, faces = CORNERS * scale, FACES
     transform = ""
@@ -257,13 +257,14 @@ def _foreign() -> list[MeshCase]:
         ("STL binary that begins with solid", ".stl", _binary_stl),
         ("PLY text", ".ply", lambda path: _ply(path, "ascii")),
         ("PLY big-endian, double", ".ply", lambda path: _ply(path, "binary_big_endian")),
-        ("OBJ, carriage returns", ".obj", lambda path: _obj(path, PLAIN_FACES, "\r\n")),
+        ("OBJ, carriage returns", ".obj", lambda path: _obj(path, PLAIN_FACES, end="\r\n")),
         ("OBJ, negative (relative) indices", ".obj", lambda path: _obj(path, "vt 0 0\nvn 0 0 1\n" + BACKWARD_FACES)),
-        ("3MF, inches", ".3mf", lambda path: _threemf(path, "inch", 1 / 25.4)),
-        ("3MF, microns", ".3mf", lambda path: _threemf(path, "micron", 1000.0)),
-        ("3MF, metres, moved by its build", ".3mf", lambda path: _threemf(path, "meter", 0.001, TURN)),
-        ("3MF, an object within an object", ".3mf", lambda path: _threemf(path, "millimeter", 1.0, TURN, nested=True)),
-        ("3MF, mirrored by its build", ".3mf", lambda path: _threemf(path, "millimeter", 1.0, MIRROR)),
+        ("3MF, inches", ".3mf", lambda path: _threemf(path, "inch", scale=1 / 25.4)),
+        ("3MF, microns", ".3mf", lambda path: _threemf(path, "micron", scale=1000.0)),
+        ("3MF, metres, moved by its build", ".3mf", lambda path: _threemf(path, "meter", scale=0.001, move=TURN)),
+        ("3MF, an object within an object", ".3mf",
+         lambda path: _threemf(path, "millimeter", scale=1.0, move=TURN, nested=True)),
+        ("3MF, mirrored by its build", ".3mf", lambda path: _threemf(path, "millimeter", scale=1.0, move=MIRROR)),
         ("GLB of another program", ".glb", lambda path: _glb(path, [{"mesh": 0}], np.eye(4))),
         ("GLB, a vertex for each corner", ".glb", lambda path: _glb(path, [{"mesh": 0}], np.eye(4), soup=True)),
         (

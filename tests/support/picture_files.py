@@ -14,7 +14,7 @@ PERSPECTIVE = Camera((0, -300, 0), (0, 0, 0), (0, 0, 1), view_angle=40.0)
 
 
 def make_picture(
-    size: tuple[int, int] = (120, 80), background: Sequence[int] = (0, 0, 0, 255), camera: Camera | None = PARALLEL
+    size: tuple[int, int] = (120, 80), *, background: Sequence[int] = (0, 0, 0, 255), camera: Camera | None = PARALLEL
 ) -> Rendering:
     """A disc of changing colour before a background, with depths where it is."""
     width, height = size

@@ -26,7 +26,7 @@ def fetch_grid(grid: Any) -> dict[str, np.ndarray]:
     }
 
 
-def scattered_points(n: int, size: tuple[float, float, float] = (40.0, 25.0, 30.0), seed: int = 1) -> np.ndarray:
+def scattered_points(n: int, *, size: tuple[float, float, float] = (40.0, 25.0, 30.0), seed: int = 1) -> np.ndarray:
     """Random points in a box around the origin, some of them equal, float32 mm."""
     rng = np.random.default_rng(seed)
     points = ((rng.random((n, 3)) - 0.5) * size).astype(np.float32)

@@ -41,7 +41,8 @@ def _make(clean: np.ndarray, normals: np.ndarray, distance: Callable, regions: d
     return Shape(clean.astype(np.float32), noisy.astype(np.float32), normals, distance, regions)
 
 
-def plane(size: float = 60.0, seed: int = 1) -> Shape:
+def plane(*, size: float = 60.0, seed: int = 1) -> Shape:
+    """A square in the plane z = 0, `size` mm wide."""
     rng = np.random.default_rng(seed)
     n = round(POINTS_A_MM2 * size**2)
     clean = np.c_[rng.uniform(-size / 2, size / 2, (n, 2)), np.zeros(n)]
@@ -49,7 +50,8 @@ def plane(size: float = 60.0, seed: int = 1) -> Shape:
     return _make(clean, np.tile([0.0, 0.0, 1.0], (n, 1)), lambda p: p[:, 2], {"inner": inner}, seed)
 
 
-def sphere(radius: float = 20.0, seed: int = 2) -> Shape:
+def sphere(*, radius: float = 20.0, seed: int = 2) -> Shape:
+    """A sphere about the origin."""
     rng = np.random.default_rng(seed)
     n = round(POINTS_A_MM2 * 4.0 * np.pi * radius**2)
     normals = rng.normal(size=(n, 3))
@@ -60,7 +62,8 @@ def sphere(radius: float = 20.0, seed: int = 2) -> Shape:
     )
 
 
-def cube(size: float = 30.0, seed: int = 3) -> Shape:
+def cube(*, size: float = 30.0, seed: int = 3) -> Shape:
+    """A cube about the origin, `size` mm wide."""
     rng = np.random.default_rng(seed)
     n, half = round(POINTS_A_MM2 * 6.0 * size**2), size / 2
     clean = rng.uniform(-half, half, (n, 3))

@@ -39,6 +39,7 @@ Field = Callable[[np.ndarray], np.ndarray]
 
 
 def centre_of(volume: Volume) -> np.ndarray:
+    """The centre of a volume, LPS mm."""
     return volume.ijk_to_lps([(np.array(volume.shape_ijk) - 1) / 2])[0]
 
 
@@ -50,6 +51,7 @@ def positions(volume: Volume) -> np.ndarray:
 
 
 def fill(volume: Volume, field: Field, dtype: Any = np.float32) -> Volume:
+    """A volume on the same grid with the values of a field, rounded where `dtype` is of whole numbers."""
     values = np.asarray(field(positions(volume).reshape(-1, 3)), dtype=np.float64).reshape(volume.voxels.shape)
     return volume.with_voxels(values.astype(dtype) if np.dtype(dtype).kind == "f" else np.rint(values).astype(dtype))
 

@@ -14,12 +14,14 @@ CUBE_FACES = ((0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 
 
 
 def box(low: Sequence[float] = (0.0, 0.0, 0.0), size: Sequence[float] = (1.0, 1.0, 1.0)) -> Arrays:
+    """A box of 8 vertices and 12 triangles from its lowest corner on."""
     corners = np.array([[c & 1, c >> 1 & 1, c >> 2] for c in range(8)], dtype=np.float64)
     triangles = [[a, b, c] for a, b, c, d in CUBE_FACES] + [[a, c, d] for a, b, c, d in CUBE_FACES]
     return np.array(low) + corners * np.array(size), np.array(triangles)
 
 
 def torus(rings: int = 15, sides: int = 8, major: float = 20.0, minor: float = 6.0) -> Arrays:
+    """A torus about z: 2 * rings * sides triangles, `major` mm to the middle of its tube of `minor` mm."""
     u, v = np.meshgrid(np.arange(rings), np.arange(sides), indexing="ij")
     a, b = 2 * np.pi * u.ravel() / rings, 2 * np.pi * v.ravel() / sides
     radius = major + minor * np.cos(b)
@@ -60,6 +62,7 @@ def torus_volume_ml(rings: int = 15, sides: int = 8, major: float = 20.0, minor:
 
 
 def moebius(pieces: int = 11) -> Arrays:
+    """A Moebius strip, which is no closed surface and has one side."""
     angle = np.arange(pieces) * 2 * np.pi / pieces
     vertices = [
         [(10 + side * np.cos(a / 2)) * np.cos(a), (10 + side * np.cos(a / 2)) * np.sin(a), side * np.sin(a / 2)]

@@ -17,11 +17,13 @@ def extract_in_slabs(
     volume: Any,
     iso_value: Any,
     device: Any,
+    *,
     slices: int,
     closed: bool = True,
     topology: Topology = "separated",
     **options: Any,
 ) -> Any:
+    """The surface of a volume whose slabs have so many slices at most."""
     resident = DeviceVolume(volume, device=device)
     rule = choose_iso_rule(volume, iso_value, closed=closed, topology=topology, **options)
     resident.most_slices[SampleGrid(volume, rule).kind] = slices
@@ -29,6 +31,7 @@ def extract_in_slabs(
 
 
 def assert_same(mesh: Any, expected: Any) -> None:
+    """Assert that two meshes are equal bit by bit."""
     assert np.array_equal(mesh.triangles, expected.triangles)
     assert np.array_equal(mesh.vertices, expected.vertices)
     assert np.array_equal(mesh.normals, expected.normals)

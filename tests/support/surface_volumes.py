@@ -20,8 +20,9 @@ SHAPES = [(5, 7, 9), (4, 4, 30), (3, 5, 31), (3, 5, 32), (4, 3, 33), (2, 3, 63),
 
 
 def random_volume(
-    shape: Sequence[int], dtype: DTypeLike = "int16", high: int = 6, affine: np.ndarray = OBLIQUE, seed: int = 0
+    shape: Sequence[int], *, dtype: DTypeLike = "int16", high: int = 6, affine: np.ndarray = OBLIQUE, seed: int = 0
 ) -> Volume:
+    """Whole numbers from 0 to below `high`, without any order."""
     return Volume(np.random.default_rng(seed).integers(0, high, shape).astype(dtype), affine)
 
 
@@ -34,7 +35,8 @@ def random_labels(shape: Sequence[int], seed: int = 1, numbers: Sequence[int] = 
     return np.where(odd, random.choice(np.array(numbers, np.uint16), shape), labels)
 
 
-def smooth_volume(shape: Sequence[int] = (23, 27, 45), affine: np.ndarray = OBLIQUE, seed: int = 1) -> Volume:
+def smooth_volume(shape: Sequence[int] = (23, 27, 45), *, affine: np.ndarray = OBLIQUE, seed: int = 1) -> Volume:
+    """Noise blurred by two voxels, int16 with a deviation of 300 HU about 0."""
     from scipy.ndimage import gaussian_filter
 
     field = gaussian_filter(np.random.default_rng(seed).normal(size=shape), 2.0)
@@ -54,7 +56,7 @@ MIDDLE = np.array([19.5, 19.0, 18.0])
 
 
 def hollow_ball(
-    radius: float = 13.0, thickness: float = 2.0, blur: float = 0.7, cortex: float = 1000.0, inner: float = 200.0,
+    *, radius: float = 13.0, thickness: float = 2.0, blur: float = 0.7, cortex: float = 1000.0, inner: float = 200.0,
     spacing: Sequence[float] = (1.0, 1.0, 1.0),
 ) -> Volume:  # fmt: skip
     """A blurred shell of bone in tissue of 50 HU, its middle at `MIDDLE` mm."""

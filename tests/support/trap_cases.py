@@ -77,7 +77,7 @@ def _sideways(folder: Path, size: Size) -> Marks:
         shift = k * GAP_MM * np.tan(np.radians(12.0)) * row
         ds.ImagePositionPatient = [round(float(v), 9) for v in plan.position(k) + shift]
 
-    marks = write_slices(folder, plan, change)
+    marks = write_slices(folder, plan, change=change)
     k = np.repeat(np.arange(size.slices), 4)[:, None]
     return replace(marks, lps_mm=marks.lps_mm + k * GAP_MM * np.tan(np.radians(12.0)) * row)
 
@@ -88,7 +88,7 @@ def _jitter(folder: Path, size: Size) -> Marks:
         turned = rotation(OBLIQUE) @ rotation((0.0, 0.0, 0.001 * (-1) ** k))
         ds.ImageOrientationPatient = [round(float(v), 9) for v in (*turned[:, 0], *turned[:, 1])]
 
-    return write_slices(folder, plan_for(size), change)
+    return write_slices(folder, plan_for(size), change=change)
 
 
 # --- uneven stacks and holes ---
@@ -139,21 +139,21 @@ _lost("two slabs, 12 slices apart", lambda n: tuple(range(n // 4, n // 4 + 12)),
 def _localizer(folder: Path, size: Size) -> Marks:
     scout = plan_for(Size(1, size.rows, size.columns), angles=(0, 90, 90), first_hu=FOREIGN_HU)
     change = _another_image(ImageType=["ORIGINAL", "PRIMARY", "LOCALIZER"])
-    write_slices(folder, scout, change, "scout")
+    write_slices(folder, scout, change=change, prefix="scout")
     return write_slices(folder, plan_for(size))
 
 
 @_case("localizer not marked as a localizer", WARNED, ("1 other CT series not used",))
 def _silent_localizer(folder: Path, size: Size) -> Marks:
     scout = plan_for(Size(1, size.rows, size.columns), angles=(0, 90, 90), first_hu=FOREIGN_HU)
-    write_slices(folder, scout, _another_image(), "scout")
+    write_slices(folder, scout, change=_another_image(), prefix="scout")
     return write_slices(folder, plan_for(size))
 
 
 @_case("two orientations in one series", REFUSED, ("different directions", "axial", "choose one with series"))
 def _two_orientations(folder: Path, size: Size) -> Marks:
     other = plan_for(Size(size.slices // 2, size.rows, size.columns), angles=(0, 90, 90), first_hu=FOREIGN_HU)
-    write_slices(folder, other, _another_image(), "other")
+    write_slices(folder, other, change=_another_image(), prefix="other")
     return write_slices(folder, plan_for(size))
 
 
@@ -166,7 +166,7 @@ def _discs(folder: Path, size: Size) -> Marks:
         def number(ds: Dataset, k: int, disc: int = disc) -> None:
             ds.SOPInstanceUID = f"{ROOT}.5.{disc + 1}.{k + 1}"
 
-        marks = write_slices(folder, plan, number, f"disc{disc}")
+        marks = write_slices(folder, plan, change=number, prefix=f"disc{disc}")
     return marks
 
 
@@ -176,7 +176,7 @@ def _two_frames(folder: Path, size: Size) -> Marks:
         if k >= size.slices // 2:
             ds.FrameOfReferenceUID = f"{ROOT}.98"
 
-    marks = write_slices(folder, plan_for(size), change)
+    marks = write_slices(folder, plan_for(size), change=change)
     marks.lps_mm[4 * (size.slices // 2) :] = np.nan
     return marks
 
@@ -192,7 +192,7 @@ def _turning(folder: Path, size: Size) -> Marks:
         for corner, (i, j) in enumerate(plan.corners()):
             truth.lps_mm[4 * k + corner] = plan.position(k) + 0.5 * i * turned[:, 0] + 0.7 * j * turned[:, 1]
 
-    write_slices(folder, plan, change)
+    write_slices(folder, plan, change=change)
     return truth
 
 
@@ -204,7 +204,7 @@ def _two_spacings(folder: Path, size: Size) -> Marks:
         if k >= size.slices // 2:
             ds.PixelSpacing = list(wide.pixel_spacing)
 
-    marks = write_slices(folder, plan_for(size), change)
+    marks = write_slices(folder, plan_for(size), change=change)
     marks.lps_mm[4 * (size.slices // 2) :] = wide.marks().lps_mm[4 * (size.slices // 2) :]
     return marks
 
@@ -213,7 +213,7 @@ def _two_spacings(folder: Path, size: Size) -> Marks:
 def _two_series(folder: Path, size: Size) -> Marks:
     marks = write_slices(folder, plan_for(size))
     other = plan_for(size, series=2, first_hu=FOREIGN_HU, origin=(40.0, 31.0, -300.0))
-    write_slices(folder, other, None, "other")
+    write_slices(folder, other, change=None, prefix="other")
     return marks
 
 
@@ -226,7 +226,7 @@ def _copies(name: str, change: Change | None) -> None:
             for file in sorted(folder.iterdir()):
                 shutil.copy(file, folder / f"copy{file.name}")
         else:
-            write_slices(folder, plan_for(size), change, "again")
+            write_slices(folder, plan_for(size), change=change, prefix="again")
         return marks
 
 
@@ -239,8 +239,8 @@ def _phases(name: str, words: tuple[str, ...], **second: Any) -> None:
     def write(folder: Path, size: Size) -> Marks:
         first = {keyword: value[0] for keyword, value in second.items()}
         last = {keyword: value[1] for keyword, value in second.items()}
-        marks = write_slices(folder, plan_for(size), set_values(**first))
-        write_slices(folder, plan_for(size, first_hu=FOREIGN_HU), _another_image(**last), "p")
+        marks = write_slices(folder, plan_for(size), change=set_values(**first))
+        write_slices(folder, plan_for(size, first_hu=FOREIGN_HU), change=_another_image(**last), prefix="p")
         return marks
 
 
@@ -254,7 +254,7 @@ _phases("two recon kernels", ("ConvolutionKernel",), ConvolutionKernel=("B30f", 
 def _one_differs(folder: Path, size: Size) -> Marks:
     marks = write_slices(folder, plan_for(size))
     others = plan_for(size, first_hu=FOREIGN_HU, leave_out=tuple(k for k in range(size.slices) if k != 5))
-    write_slices(folder, others, _another_image(), "again")
+    write_slices(folder, others, change=_another_image(), prefix="again")
     return marks
 
 
@@ -266,9 +266,9 @@ def _one_differs(folder: Path, size: Size) -> Marks:
     again_words=("phase 1 of 2",),
 )
 def _phase_with_a_hole(folder: Path, size: Size) -> Marks:
-    marks = write_slices(folder, plan_for(size), set_values(AcquisitionNumber=1))
+    marks = write_slices(folder, plan_for(size), change=set_values(AcquisitionNumber=1))
     second = plan_for(size, first_hu=FOREIGN_HU, leave_out=(size.slices // 2,))
-    write_slices(folder, second, _another_image(AcquisitionNumber=2), "p")
+    write_slices(folder, second, change=_another_image(AcquisitionNumber=2), prefix="p")
     return marks
 
 
@@ -276,7 +276,7 @@ def _phase_with_a_hole(folder: Path, size: Size) -> Marks:
 @_case("a slice without its position", REFUSED, ("ImagePositionPatient (0020,0032) is missing or empty",))
 def _no_position(folder: Path, size: Size) -> Marks:
     change = set_values(only=size.slices // 2, ImagePositionPatient=None)
-    return write_slices(folder, plan_for(size), change)
+    return write_slices(folder, plan_for(size), change=change)
 
 
 _simple(
@@ -302,7 +302,7 @@ def _enhanced(name: str, **kw: Any) -> None:
     def write(folder: Path, size: Size) -> Marks:
         plan = plan_for(size, slopes=(1, 2, 3, 4), **options.get("plan", {}))
         order = [(k * 7 + 3) % size.slices for k in range(size.slices)] if options.get("order") else None
-        save_enhanced(folder / "enhanced.dcm", plan, order)
+        save_enhanced(folder / "enhanced.dcm", plan, order=order)
         return plan.marks()
 
 

@@ -37,7 +37,7 @@ def _interleaved(name: str, keyword: str, first: Any, second: Any) -> None:
             elif keyword in ds:
                 delattr(ds, keyword)
 
-        write_slices(folder, plan_for(size), change)
+        write_slices(folder, plan_for(size), change=change)
         return plan_for(size).marks(range(1, size.slices, 2))
 
 

@@ -112,6 +112,8 @@ CASES: dict[str, Case] = {}
 
 
 def add_case(name: str, *args: Any, **options: Any) -> Callable[[Callable[[Path, Size], Marks]], None]:
+    """A decorator that adds a row to `CASES`."""
+
     def add(write: Callable[[Path, Size], Marks]) -> None:
         assert name not in CASES
         CASES[name] = Case(name, write, *args, **options)
@@ -120,11 +122,12 @@ def add_case(name: str, *args: Any, **options: Any) -> Callable[[Callable[[Path,
 
 
 def plan_for(size: Size, **changes: Any) -> MarkedPlan:
+    """An oblique plan of this size."""
     plan = MarkedPlan(shape=(size.slices, size.rows, size.columns), gap=GAP_MM, angles=OBLIQUE)
     return replace(plan, **changes)
 
 
-def write_slices(folder: Path, plan: MarkedPlan, change: Change | None = None, prefix: str = "") -> Marks:
+def write_slices(folder: Path, plan: MarkedPlan, *, change: Change | None = None, prefix: str = "") -> Marks:
     """Write the slices with every attribute that readers ask for; InstanceNumber runs along the normal."""
     for k in range(plan.shape[0]):
         if k in plan.leave_out:
@@ -146,4 +149,6 @@ def add_simple(
     name: str, *args: Any, change: Change | None = None, plan: Mapping[str, Any] | None = None, **kw: Any
 ) -> None:
     """A case of one stack, its plan and its slices changed."""
-    add_case(name, *args, **kw)(lambda folder, size: write_slices(folder, plan_for(size, **(plan or {})), change))
+    add_case(name, *args, **kw)(
+        lambda folder, size: write_slices(folder, plan_for(size, **(plan or {})), change=change)
+    )

@@ -16,6 +16,7 @@ CENTRE = 47.5
 
 
 def radius_from(x: float = CENTRE, y: float = CENTRE) -> np.ndarray:
+    """Distance of each pixel from a place, in pixels."""
     j, i = np.mgrid[: SHAPE[1], : SHAPE[2]]
     return np.hypot(i - x, j - y)
 
@@ -31,12 +32,14 @@ def make_layers(background: float, *layers: tuple[float, float], noise: float = 
     return np.rint(hu + np.random.default_rng(5).normal(0.0, noise, SHAPE))
 
 
-def make_body(noise: float = 12.0) -> np.ndarray:
+def make_body(*, noise: float = 12.0) -> np.ndarray:
     """Fat, muscle, spongy and dense bone in air; the dense bone is above 1024 HU, beyond the sign of 12 bits."""
     return np.maximum(make_layers(-1000, (40, -100), (35, 50), (12, 1500), (10, 250), noise=noise), -1024)
 
 
-def make_jaw(slope: float = 1.0, offset: float = 400.0, padding: float | None = 0.0, noise: float = 40.0) -> np.ndarray:
+def make_jaw(
+    *, slope: float = 1.0, offset: float = 400.0, padding: float | None = 0.0, noise: float = 40.0
+) -> np.ndarray:
     """A jaw in a cone beam: values ``slope * HU + offset``, and one value outside of a round field of view."""
     hu = make_layers(-1000, (38, -90), (35, 50), noise=noise)
     i = np.arange(SHAPE[2]) - CENTRE
@@ -46,7 +49,7 @@ def make_jaw(slope: float = 1.0, offset: float = 400.0, padding: float | None = 
     return values if padding is None else np.where(radius_from() > 46, padding, values)
 
 
-def make_table(undefined: bool = True) -> Sequence:
+def make_table(*, undefined: bool = True) -> Sequence:
     """A Modality LUT of 4,096 entries, which is an inverted ramp, as a sequence of undefined or defined length."""
     table = Dataset()
     table.LUTDescriptor, table.ModalityLUTType = [4096, 0, 16], "US"

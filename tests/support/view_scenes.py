@@ -25,7 +25,7 @@ def middle(number: int) -> np.ndarray:
     return AFFINE[:3, :3] @ np.array(BALLS[number][0]) + AFFINE[:3, 3]
 
 
-def make_scan(affine: np.ndarray = AFFINE, dtype: Any = np.int16, scale: float = 1.0) -> Volume:
+def make_scan(*, affine: np.ndarray = AFFINE, dtype: Any = np.int16, scale: float = 1.0) -> Volume:
     """Balls of 1000 HU whose surface at 300 HU lies at their radius, in -800 HU."""
     k, j, i = np.indices(SHAPE, dtype=np.float64)
     places = np.stack([i, j, k], axis=-1) @ AFFINE[:3, :3].T + AFFINE[:3, 3]
@@ -36,13 +36,13 @@ def make_scan(affine: np.ndarray = AFFINE, dtype: Any = np.int16, scale: float =
     return Volume(np.rint(scale * hu).astype(dtype), affine)
 
 
-def make_mesh(at: np.ndarray | None = None, radius: float = 4.0) -> Mesh:
+def make_mesh(*, at: np.ndarray | None = None, radius: float = 4.0) -> Mesh:
     """A ball in front of the scan."""
     vertices, triangles = ball(radius, 24)
     return Mesh(vertices + (middle(0) + (0.0, -25.0, 0.0) if at is None else at), triangles)
 
 
-def make_cloud(count: int = 200) -> PointCloud:
+def make_cloud(*, count: int = 200) -> PointCloud:
     """Points around the second ball."""
     points = np.random.default_rng(1).normal(size=(count, 3))
     points *= 7.0 / np.linalg.norm(points, axis=1, keepdims=True)

@@ -19,7 +19,7 @@ META_TYPES = {"i1": "CHAR", "u1": "UCHAR", "i2": "SHORT", "u2": "USHORT", "i4": 
               "i8": "LONG_LONG", "u8": "ULONG_LONG", "f4": "FLOAT", "f8": "DOUBLE"}  # fmt: skip
 
 
-def make_ct(shape: Sequence[int] = (4, 6, 7), seed: int = 0, low: int = -1024, high: int = 3000) -> np.ndarray:
+def make_ct(shape: Sequence[int] = (4, 6, 7), *, seed: int = 0, low: int = -1024, high: int = 3000) -> np.ndarray:
     """voxels[k, j, i], int16 HU."""
     return np.random.default_rng(seed).integers(low, high, shape).astype(np.int16)
 

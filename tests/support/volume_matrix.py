@@ -57,7 +57,9 @@ def affine_of(plan: Plan) -> np.ndarray:
     return affine
 
 
-def of_plan(name: str, plan: Plan, options: tuple[str, ...] = (), cut: slice = slice(None), **more: Any) -> Export:
+def of_plan(name: str, plan: Plan, *, options: tuple[str, ...] = (), cut: slice = slice(None), **more: Any) -> Export:
+    """An export of a series; `cut` are the slices that the file must have."""
+
     def truth() -> Truth:
         affine = affine_of(plan)
         affine[:3, 3] += (cut.start or 0) * affine[:3, 2]
@@ -71,6 +73,8 @@ def of_plan(name: str, plan: Plan, options: tuple[str, ...] = (), cut: slice = s
 
 
 def of_file(name: str, kind: str, affine: np.ndarray, **more: Any) -> Export:
+    """An export of a file of volumes."""
+
     def write(folder: Path) -> Path:
         return WRITERS[kind](folder / kind, make_ct(), affine)
 
@@ -89,6 +93,7 @@ def uneven_resampled() -> Truth:
 
 
 def only(words: str, *extensions: str) -> Callable[[str], str]:
+    """Words of a refusal for some extensions, and none for the others."""
     return lambda extension: words if extension in extensions else ""
 
 
@@ -103,7 +108,7 @@ def _list_exports() -> Iterator[Export]:
     yield of_plan("100 m away", Plan(shape=SHAPE, origin=(1e5 + 0.123, -1e5, 1e5)), refused=far)
     yield of_plan("HU with halves", Plan(shape=SHAPE, slope=0.5))  # type: ignore[arg-type]
     yield of_plan("HU beyond 16 bits", Plan(shape=SHAPE, slope=60))
-    yield of_plan("cropped", Plan(shape=SHAPE), ("--between", "-398,"), slice(2, None))
+    yield of_plan("cropped", Plan(shape=SHAPE), options=("--between", "-398,"), cut=slice(2, None))
     yield of_plan("uneven", UNEVEN, refused=lambda extension: "slices of this volume are uneven")
     yield Export("uneven, resampled to 1 mm", of_plan("", UNEVEN).write, uneven_resampled, ("--resample", "1"))
     yield of_file("from NIfTI-2, left-handed", "two.nii", ROTATED @ np.diag((1.0, -1.0, 1.0, 1.0)))

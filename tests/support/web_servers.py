@@ -73,13 +73,14 @@ class Server:
 
 @contextmanager
 def running(server: Any) -> Iterator[Any]:
+    """Close a server at the end."""
     try:
         yield server
     finally:
         server.close()
 
 
-def send(handler: Handler, content: bytes, kind: str = "text/plain", status: int = 200, **headers: str) -> None:
+def send(handler: Handler, content: bytes, *, kind: str = "text/plain", status: int = 200, **headers: str) -> None:
     """Send an answer; headers of the same name, such as Content_Length, replace the true ones."""
     handler.send_response(status)
     named = {"Content-Type": kind, "Content-Length": str(len(content))}
@@ -92,8 +93,9 @@ def send(handler: Handler, content: bytes, kind: str = "text/plain", status: int
         handler.wfile.write(content)
 
 
-def answering(content: bytes = b"", kind: str = "text/plain", status: int = 200, **headers: str) -> Answer:
-    return lambda handler: send(handler, content, kind, status, **headers)
+def answering(content: bytes = b"", *, kind: str = "text/plain", status: int = 200, **headers: str) -> Answer:
+    """An answer with this content."""
+    return lambda handler: send(handler, content, kind=kind, status=status, **headers)
 
 
 def join_parts(contents: Sequence[bytes], *, kind: str = "application/dicom", length: int | str | None = None) -> bytes:
@@ -123,13 +125,13 @@ class Archive(Server):
             return
         top = f"/dicom-web/studies/{STUDY}"
         if parts.path in (top, f"{top}/series/{SERIES}") and "transfer-syntax=*" in handler.headers["Accept"]:
-            send(handler, join_parts(self.instances), STORED)
+            send(handler, join_parts(self.instances), kind=STORED)
         elif parts.path == "/dicom-web/studies":
-            send(handler, b"[]", "application/dicom+json")
+            send(handler, b"[]", kind="application/dicom+json")
         elif parts.path in (f"{top}/instances", f"{top}/series/{SERIES}/instances"):
             start = int(parse_qs(parts.query).get("offset", ["0"])[0])
             uids = self.uids[start : start + self.page]
-            send(handler, json.dumps([list_entry(uid) for uid in uids]).encode(), "application/dicom+json")
+            send(handler, json.dumps([list_entry(uid) for uid in uids]).encode(), kind="application/dicom+json")
         else:
             send(handler, b"", status=404)
 
@@ -156,19 +158,19 @@ class BucketServer(Server):
         key = unquote(parts.path).removeprefix("/scans").lstrip("/")
         if self.is_closed:
             text = b"<Error><Code>AccessDenied</Code><AWSAccessKeyId>AKIASECRET</AWSAccessKeyId></Error>"
-            send(handler, text, "application/xml", 403)
+            send(handler, text, kind="application/xml", status=403)
         elif key:
             self._send_object(handler, key)
         else:
             prefix = parse_qs(parts.query).get("prefix", [""])[0]
-            send(handler, self._list_objects(prefix), "application/xml")
+            send(handler, self._list_objects(prefix), kind="application/xml")
 
     def _send_object(self, handler: Handler, key: str) -> None:
         if key not in self.objects:
-            send(handler, b"<Error><Code>NoSuchKey</Code></Error>", "application/xml", 404)
+            send(handler, b"<Error><Code>NoSuchKey</Code></Error>", kind="application/xml", status=404)
             return
         modified = "Sat, 28 Nov 2026 12:00:00 GMT"
-        send(handler, self.objects[key], "application/octet-stream", ETag='"1"', Last_Modified=modified)
+        send(handler, self.objects[key], kind="application/octet-stream", ETag='"1"', Last_Modified=modified)
 
     def _list_objects(self, prefix: str) -> bytes:
         entries = "".join(

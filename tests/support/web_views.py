@@ -200,4 +200,5 @@ def get_path(running: WebServer, path: str, method: str = "GET", **headers: str)
 
 
 def secret_of(running: WebServer) -> str:
+    """The secret in the address of a server."""
     return running.address.partition("secret=")[2]

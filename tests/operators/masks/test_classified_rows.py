@@ -36,7 +36,7 @@ def inside_rows(inside, border, words):
 @pytest.mark.parametrize("dtype", ["int16", "uint8", "float32"])
 @pytest.mark.parametrize("columns", [8, 31, 32, 40, 64, 65, 72, 128])
 def test_inside_bits_and_extents_of_rows_equal_those_of_numpy(device_as_gpu, columns, dtype, closed):
-    volume = random_volume((3, 5, columns), dtype, high=100)
+    volume = random_volume((3, 5, columns), dtype=dtype, high=100)
     volume.voxels[1, 2] = 0  # a row without bits
     volume.voxels[0, :, -1] = 99  # rows whose last bit is set
     grid = SampleGrid(volume, choose_iso_rule(volume, 60, closed=closed))

@@ -46,11 +46,11 @@ def assert_clusters_equal_twin(device, points, *, eps, min_samples):
 @pytest.mark.parametrize("min_samples", [1, 2, 5])
 @pytest.mark.parametrize("eps", daily(1, [0.8, 2.0]))
 def test_clusters_of_scattered_points_equal_the_twin(device, kernel_form, n, min_samples, eps):
-    assert_clusters_equal_twin(device, scattered_points(n, BOX), eps=eps, min_samples=min_samples)
+    assert_clusters_equal_twin(device, scattered_points(n, size=BOX), eps=eps, min_samples=min_samples)
 
 
 def test_report_of_free_clusters_counts_clusters_and_noise(device):
-    points = scattered_points(1000, BOX)
+    points = scattered_points(1000, size=BOX)
     facts = cluster_free_points(points, eps=0.8, min_samples=5, device=device).facts
     count, labels, _ = twin.cluster_points(points, eps=0.8, min_samples=5)
     assert facts["clusters"] == count > 0
@@ -58,7 +58,7 @@ def test_report_of_free_clusters_counts_clusters_and_noise(device):
 
 
 def test_clustering_leaves_the_points_as_they_are(device):
-    points = scattered_points(1000, BOX)
+    points = scattered_points(1000, size=BOX)
     before = points.copy()
     cluster_free_points(points, eps=0.8, min_samples=5, device=device)
     assert np.array_equal(points, before)
@@ -66,7 +66,7 @@ def test_clustering_leaves_the_points_as_they_are(device):
 
 @pytest.mark.parametrize("per_chunk", [32, 64, 640])
 def test_clusters_are_the_same_in_chunks_of_any_size(device, kernel_form, per_chunk):
-    points = scattered_points(4000, BOX, seed=2)
+    points = scattered_points(4000, size=BOX, seed=2)
     labels, *_ = find_clusters(device, plan_cells(points, eps=1.0), eps=1.0, min_samples=3, per_chunk=per_chunk)
     _, expected, _ = twin.cluster_points(points, eps=1.0, min_samples=3)
     assert np.array_equal(labels, expected)
@@ -74,7 +74,7 @@ def test_clusters_are_the_same_in_chunks_of_any_size(device, kernel_form, per_ch
 
 @pytest.mark.oclgrind
 def test_clusters_found_in_small_chunks_equal_the_twin(device):
-    points = scattered_points(400, (12.0, 8.0, 6.0))
+    points = scattered_points(400, size=(12.0, 8.0, 6.0))
     labels, cores, count, _ = find_clusters(device, plan_cells(points, eps=1.1), eps=1.1, min_samples=4, per_chunk=32)
     expected_count, expected, expected_cores = twin.cluster_points(points, eps=1.1, min_samples=4)
     assert count == expected_count > 1
@@ -104,7 +104,7 @@ def test_points_too_far_apart_for_cells_of_eps_are_refused():
         plan_cells([[0.0, 0.0, 0.0], [1e7, 0.0, 0.0]], eps=1.0)
 
 
-POINTS_OF_PASSES = scattered_points(5000, BOX, seed=3)
+POINTS_OF_PASSES = scattered_points(5000, size=BOX, seed=3)
 EPS_OF_PASSES, MIN_SAMPLES_OF_PASSES, CHUNK = 0.9, 3, 64
 WIDENED_EPS = 1.0 + 1e-6  # within it points are neighbours, so that those at eps are, however it is rounded
 
@@ -213,7 +213,7 @@ def test_dense_spots_are_joined_where_their_gap_is_within_eps(device, gap, clust
 @pytest.fixture(scope="module")
 def clusters_in_two_orders(device):
     """Clusters of points, and those of the points permuted; the permutation."""
-    points = scattered_points(5000, BOX, seed=6)
+    points = scattered_points(5000, size=BOX, seed=6)
     order = np.random.default_rng(7).permutation(len(points))
     how = {"eps": 0.9, "min_samples": 4, "device": device}
     return cluster_free_points(points, **how), cluster_free_points(points[order], **how), order
@@ -235,7 +235,7 @@ def test_clusters_are_numbered_by_their_first_core_point(clusters_in_two_orders)
 
 def test_far_clouds_have_the_clusters_of_near_ones(device):
     """Coordinates are relative to whole millimetres, so these are the same numbers."""
-    points = np.rint(scattered_points(3000, BOX, seed=8) * 256.0) / 256.0
+    points = np.rint(scattered_points(3000, size=BOX, seed=8) * 256.0) / 256.0
     near = cluster_free_points(points, eps=0.9, min_samples=3, device=device)
     far = cluster_free_points(PointCloud(points + (1e5, -2e5, 3e5)), eps=0.9, min_samples=3, device=device)
     assert near.count > 1
@@ -244,7 +244,7 @@ def test_far_clouds_have_the_clusters_of_near_ones(device):
 
 @pytest.mark.parametrize("eps", [60.0, 1e6, 1e30])
 def test_eps_beyond_the_box_gives_one_cluster_in_one_cell(device, eps):
-    found = cluster_free_points(scattered_points(500, BOX), eps, min_samples=500, device=device)
+    found = cluster_free_points(scattered_points(500, size=BOX), eps, min_samples=500, device=device)
     assert found.facts["cells"] == 1
     assert (found.labels == 0).all()
 
@@ -275,13 +275,13 @@ def test_points_that_are_not_finite_are_refused_with_their_number(device):
 
 def test_eps_that_needs_too_many_cells_is_refused_with_their_numbers(device):
     with pytest.raises(UsageError, match="has 5,[0-9,]+ x 3,[0-9,]+ x 3,[0-9,]+ of them"):  # 40 mm / (eps / sqrt(3))
-        cluster_free_points(scattered_points(100, (40.0, 25.0, 30.0)), eps=0.0129, device=device)
+        cluster_free_points(scattered_points(100, size=(40.0, 25.0, 30.0)), eps=0.0129, device=device)
 
 
 @pytest.fixture(scope="module")
 def two_million_points():
     """In a cube of 3 mm."""
-    return scattered_points(2_000_000, (3.0, 3.0, 3.0))
+    return scattered_points(2_000_000, size=(3.0, 3.0, 3.0))
 
 
 def test_too_many_pairs_are_refused_before_they_are_compared(device, two_million_points):
@@ -310,7 +310,7 @@ CLUSTERING = {"eps": 1.1, "min_samples": 3}
 @pytest.fixture(scope="module")
 def clustered_cloud(device):
     """A cloud without voxels, and what `cluster_points` makes of it."""
-    cloud = PointCloud(scattered_points(2000, BOX), hu=np.arange(2000))
+    cloud = PointCloud(scattered_points(2000, size=BOX), hu=np.arange(2000))
     return cloud, cluster_points(cloud, **CLUSTERING, device=device)
 
 
@@ -351,5 +351,5 @@ def test_clusters_of_a_large_cloud_equal_the_twin_with_a_warning_where_work_item
     """Shares of a core would be longer than llvmpipe's loops: nearly all labels were wrong, without a word."""
     if device.most_steps is None:
         pytest.skip("work-items of this device do not end early")
-    assert_clusters_equal_twin(device, scattered_points(60_000, (60.0, 40.0, 30.0)), eps=1.2, min_samples=4)
+    assert_clusters_equal_twin(device, scattered_points(60_000, size=(60.0, 40.0, 30.0)), eps=1.2, min_samples=4)
     assert any("ends the loops of a work-item" in text for text in device.warnings)

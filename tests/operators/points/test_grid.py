@@ -82,7 +82,7 @@ def test_two_far_points_leave_an_empty_grid_between_them(device, axis):
 
 
 def test_points_lie_in_their_cells_except_for_the_rounding_of_float32(device):
-    points = scattered_points(20_000, (900.0, 20.0, 20.0))
+    points = scattered_points(20_000, size=(900.0, 20.0, 20.0))
     grid = make_grid(device, points, edge=0.21)
     cells = twin.find_cells(points, (grid.origin - grid.base).astype(np.float32), np.float32(grid.edge))
     from_origin = points.astype(np.float64) - grid.origin

@@ -92,7 +92,7 @@ def neighbours_and_tree(device):
     """The K nearest of 8000 points, and by scipy's tree K + 1: distances and indices."""
     from scipy.spatial import cKDTree
 
-    points = scattered_points(8000, (30.0, 30.0, 30.0))
+    points = scattered_points(8000, size=(30.0, 30.0, 30.0))
     exact = points.astype(np.float64)
     return find_neighbours(PointCloud(points), K, device=device), *cKDTree(exact).query(exact, K + 1)
 

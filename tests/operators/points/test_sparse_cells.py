@@ -20,7 +20,7 @@ from clrecon.proof.points import clusters as twin
 @pytest.mark.parametrize(("fewest", "threshold"), [(1, 1), (2, 2), (2, 5), (3, 2), (4, 9)])
 @pytest.mark.parametrize("keep_largest", [False, True])
 def test_sparse_cells_mark_each_point_as_the_twin_does(device, n, fewest, threshold, keep_largest):
-    points = scattered_points(n, (30.0, 20.0, 10.0), seed=n)
+    points = scattered_points(n, size=(30.0, 20.0, 10.0), seed=n)
     edge = 1.15 * (30.0 * 20.0 * 10.0 / n) ** (1 / 3)  # cells of some 1.5 points
     rules = {"fewest": fewest, "threshold": threshold, "largest": keep_largest}
     grown = grow_cells(device, plan_grid(points, edge), **rules)
@@ -29,7 +29,7 @@ def test_sparse_cells_mark_each_point_as_the_twin_does(device, n, fewest, thresh
 
 @pytest.mark.oclgrind
 def test_sparse_cells_of_a_small_cloud_equal_the_twin(device):
-    points = scattered_points(600, (20.0, 14.0, 9.0))
+    points = scattered_points(600, size=(20.0, 14.0, 9.0))
     rules = {"fewest": 2, "threshold": 3, "largest": True}
     grown = grow_cells(device, plan_grid(points, edge=1.5), **rules)
     assert set(np.unique(grown.removed)) == {0, *range(1, len(REASONS) + 1)}, "the cloud has no points of some reason"
@@ -184,7 +184,7 @@ def test_too_little_memory_for_sparse_cells_is_refused(device):
 
 
 def test_points_removed_for_each_reason_are_counted(device):
-    points, rules = scattered_points(600, (20.0, 14.0, 9.0)), {"edge": 1.5, "fewest": 2, "threshold": 3}
+    points, rules = scattered_points(600, size=(20.0, 14.0, 9.0)), {"edge": 1.5, "fewest": 2, "threshold": 3}
     step = remove_sparse_cells(points, **rules, keep_largest=True, device=device)
     assert step.reasons == REASONS
     assert list(step.counts.values()) == [np.count_nonzero(step.removed == mark) for mark in (1, 2, 3)]

@@ -20,7 +20,7 @@ BRICKS = pytest.mark.parametrize("shape", [(1, 1, 1), (3, 9, 7), (8, 8, 8), (9, 
 
 def measured_bricks(device, shape, dtype):
     """Random values, all 99 in the second half of each row; bricks as the device and as the twin measure them."""
-    volume = random_volume(shape, dtype, high=100)
+    volume = random_volume(shape, dtype=dtype, high=100)
     volume.voxels[:, :, shape[2] // 2 :] = 99
     measured = measure_bricks(device, upload(device, volume.voxels), volume.shape_ijk, volume.voxels.dtype)
     return measured, twin.measure_bricks(volume.voxels)

@@ -33,7 +33,7 @@ def test_modality_lut_of_one_slice_fails_the_gate_of_hu_with_a_warning_in_any_en
     def change(ds, k):
         if k != 3:
             return
-        set_values(ModalityLUTSequence=make_table(undefined))(ds, k)
+        set_values(ModalityLUTSequence=make_table(undefined=undefined))(ds, k)
         if syntax == ExplicitVRBigEndian:
             table = ds.ModalityLUTSequence[0]
             table.LUTData = np.frombuffer(table.LUTData, "<u2").astype(">u2").tobytes()

@@ -99,7 +99,7 @@ def test_fault_22_every_frame_has_its_own_rescale(tmp_path):
     plan = write_enhanced(tmp_path / "mf", Plan(shape=(4, 5, 6)), order=(2, 0, 3, 1), slopes=(1, 2, 3, 4))
     volume = read_volume(tmp_path)
     expected = np.stack([plan.stored(k).astype(int) * (k + 1) + plan.intercept for k in range(4)])
-    assert_right(volume, plan, expected)
+    assert_right(volume, plan, hu=expected)
     lowest_and_highest_slope, intercepts = [1.0, 4.0], [plan.intercept, plan.intercept]
     assert volume.report["rescale"] == {"slope": lowest_and_highest_slope, "intercept": intercepts, "type": "HU"}
 
@@ -119,7 +119,7 @@ def test_enhanced_images_of_every_uncompressed_encoding_are_read(tmp_path, synta
 
     plan = write_enhanced(tmp_path / "mf", Plan(syntax=syntax), leave_lengths_out, order=SHUFFLED, slopes=range(1, 8))
     expected = np.stack([plan.stored(k).astype(int) * (k + 1) + plan.intercept for k in range(7)])
-    assert_right(read_volume(tmp_path), plan, expected)
+    assert_right(read_volume(tmp_path), plan, hu=expected)
 
 
 @pytest.mark.parametrize("syntax", daily(1, [RLELossless, JPEG2000Lossless, JPEGLSLossless]))
@@ -338,10 +338,10 @@ def test_element_of_a_frame_goes_before_the_shared_one(tmp_path):
 def test_frames_without_a_rescale_are_in_hu_by_their_real_world_values_with_a_warning(tmp_path, kind):
     to_density = real_world(slope=0.1, intercept=7.0, code="mg/cm3")
     to_hu = real_world(slope=2.0, intercept=-1000.0)
-    plan = write_enhanced(tmp_path / "mf", change=without_rescale([to_density, to_hu], kind))
+    plan = write_enhanced(tmp_path / "mf", change=without_rescale([to_density, to_hu], kind=kind))
     volume = read_volume(tmp_path)
     stored = plan.hu() - plan.intercept
-    assert_right(volume, plan, 2 * stored - 1000)
+    assert_right(volume, plan, hu=2 * stored - 1000)
     assert volume.report["rescale"]["type"] == "HU"
     assert volume.report["warnings"] == [
         ("RescaleType is US" if kind else "no RescaleSlope") + ": HU by RealWorldValueMappingSequence (0040,9096) "

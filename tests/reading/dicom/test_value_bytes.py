@@ -121,7 +121,7 @@ def test_series_with_two_values_of_one_element_is_refused(tmp_path, keyword, val
     plan = Plan(**{**vars(PLAN), "syntax": ImplicitVRLittleEndian} if implicit else vars(PLAN))
     write_series(tmp_path, plan)
     for file in tmp_path.iterdir():
-        insert_after(file, keyword, element_bytes(keyword, value, implicit), implicit)
+        insert_after(file, keyword, element_bytes(keyword, value, implicit=implicit), implicit=implicit)
     assert_refused(tmp_path, f"IM0000: {keyword} (", "is there twice, with two values")
 
 
@@ -195,7 +195,7 @@ def write_frames(path: Path, syntax: str, change: Callable[[bytes], bytes]) -> N
     open_sequences(ds)
     save_dataset(ds, path)
     data, implicit = path.read_bytes(), syntax == ImplicitVRLittleEndian
-    head = element_bytes("ImagePositionPatient", b"", implicit)[: 4 if implicit else 6]
+    head = element_bytes("ImagePositionPatient", b"", implicit=implicit)[: 4 if implicit else 6]
     place = data.rindex(head)
     length = int.from_bytes(data[place + len(head) : place + 8], "little")
     element = data[place : place + 8 + length]

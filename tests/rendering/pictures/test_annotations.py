@@ -129,7 +129,7 @@ def test_scale_bar_is_as_long_as_its_mm_in_pixels(size, background, ink):
     rng = np.random.default_rng(size[0])
     for scale in rng.uniform(1.0, 400.0, 5):
         camera = Camera(position=(0, -900, 0), focal_point=(0, 0, 0), up=(0, 0, 1), parallel_scale=scale)
-        picture = make_picture(size, background, camera)
+        picture = make_picture(size, background=background, camera=camera)
         picture.image[:] = background
         marked = picture.annotated(scale_bar=True)
         width, height = size
@@ -139,7 +139,8 @@ def test_scale_bar_is_as_long_as_its_mm_in_pixels(size, background, ink):
 
 
 def test_scale_bar_on_white_is_black_and_leaves_the_other_pixels():
-    picture = make_picture((300, 200), WHITE, PARALLEL)  # 1 mm a pixel: twice the scale of 100 mm over 200 rows
+    # 1 mm a pixel: twice the scale of 100 mm over 200 rows
+    picture = make_picture((300, 200), background=WHITE, camera=PARALLEL)
 
     marked = picture.annotated(scale_bar=True)
 
@@ -151,7 +152,7 @@ def test_scale_bar_on_white_is_black_and_leaves_the_other_pixels():
 
 
 def test_scale_bar_of_a_perspective_picture_is_true_in_the_focal_plane_and_says_so(monkeypatch):
-    picture = make_picture((400, 300), BLACK, PERSPECTIVE)
+    picture = make_picture((400, 300), background=BLACK, camera=PERSPECTIVE)
     picture.image[:] = BLACK
     texts = []
     draw = ImageDraw.ImageDraw.text
@@ -168,7 +169,7 @@ def test_scale_bar_of_a_perspective_picture_is_true_in_the_focal_plane_and_says_
 
 @pytest.mark.parametrize("background", [BLACK, WHITE, CLEAR, (128, 128, 128, 255)])
 def test_letters_stand_at_each_edge_and_stand_out_from_the_background(background):
-    picture = make_picture((400, 300), background)
+    picture = make_picture((400, 300), background=background)
 
     marked = picture.annotated(letters=True)
 
@@ -184,9 +185,9 @@ def test_letters_stand_at_each_edge_and_stand_out_from_the_background(background
 
 
 def test_annotations_leave_the_picture_that_they_are_drawn_from():
-    picture = make_picture((400, 300), BLACK)
+    picture = make_picture((400, 300), background=BLACK)
     picture.annotated(letters=True)
-    assert np.array_equal(picture.image, make_picture((400, 300), BLACK).image)
+    assert np.array_equal(picture.image, make_picture((400, 300), background=BLACK).image)
 
 
 def test_picture_of_64_pixels_has_room_for_letters_and_scale_bar():
