@@ -136,7 +136,8 @@ def test_server_that_stays_busy_is_unreachable_after_four_tries_with_longer_paus
 ) -> None:
     archive.answers = [answering(status=503)] * 4
 
-    with refused(UnreachableError, archive.host, 503, 4) as caught:
+    status, tries = 503, 4
+    with refused(UnreachableError, archive.host, status, tries) as caught:
         read_volume(archive.url)
 
     assert pauses == [0.5, 1.0, 2.0]

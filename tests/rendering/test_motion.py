@@ -226,7 +226,7 @@ def test_folder_of_an_animation_with_another_file_is_refused_and_stays(tmp_path)
     write_animation(moving_frames(2), tmp_path / "turn")
     (tmp_path / "turn" / "notes.txt").write_text("mine")
 
-    with refused(UsageError, "notes.txt", 1):
+    with refused(UsageError, "notes.txt", 1):  # thing that is no frame
         write_animation(moving_frames(2), tmp_path / "turn")
 
     assert names_in(tmp_path / "turn") == ["frame_0000.png", "frame_0001.png", "notes.txt"]

@@ -146,5 +146,5 @@ def test_table_is_put_between_its_markers_in_place_of_the_old_one() -> None:
 
 
 def test_table_without_its_markers_is_refused() -> None:
-    with refused(ValueError, 0, "tables"):
+    with refused(ValueError, 0, "tables", "'y'"):  # none has that mark
         marked_tables.put_table(MARKED, "y", "new")

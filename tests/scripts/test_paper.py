@@ -40,8 +40,8 @@ def test_distances_in_the_paper_are_those_of_the_records(rule: str) -> None:
 
 def test_misread_and_refused_series_of_the_paper_are_those_of_the_page_of_calibration() -> None:
     page = (DOCS / "calibration.md").read_text(encoding="utf-8")
-    of_reading = list(MATRICES)[:2]  # the others are of volumes that clrecon writes
-    tables = [count_wrong(find_table(page, name)) for name in of_reading]
+    of_dicom = list(MATRICES)[:2]  # the others are of other formats
+    tables = [count_wrong(find_table(page, name)) for name in of_dicom]
     readers = {
         name: [sum(counts) for counts in zip(*(table[name] for table in tables), strict=True)] for name in tables[0]
     }

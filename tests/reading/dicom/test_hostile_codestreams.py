@@ -19,8 +19,8 @@ from compressed_frames import (
     even,
     item,
     make_headers,
-    place,
 )
+from compressed_frames import place as write_and_load
 from dicom_series import Plan, make_dataset, save_dataset, write_series
 from pydicom.encaps import encapsulate
 from refusals import refused
@@ -69,7 +69,7 @@ def test_codestream_that_contradicts_its_header_or_is_cut_is_refused(tmp_path, n
     syntax, encode = ENCODERS[name]
     data = item(b"") + item(even(spoil(encode(IMAGES[0])))) + END
     with pytest.raises(RefusedInputError, match=f"^pixels: .*({words})"):
-        place(tmp_path, data, syntax)
+        write_and_load(tmp_path, data, syntax)
 
 
 @pytest.mark.fault_row(38)
@@ -84,7 +84,7 @@ def test_codestream_far_too_small_for_its_size_is_refused(tmp_path):
 
 def test_codestream_of_air_alone_is_decoded_though_it_is_small(tmp_path):
     air = np.zeros((512, 512), np.uint16)
-    (pixels,) = place(tmp_path, encapsulate([encode_jpeg_2000(air)]) + END, rows=512, columns=512)
+    (pixels,) = write_and_load(tmp_path, encapsulate([encode_jpeg_2000(air)]) + END, rows=512, columns=512)
     assert not pixels.any()
 
 

@@ -74,7 +74,7 @@ def test_folder_that_cannot_be_read_refuses_the_series(tmp_path, deny):
 def test_folder_of_a_file_that_cannot_be_opened_alone_is_refused_as_no_dicom(tmp_path, deny):
     write_series(tmp_path, Plan(shape=(1, 5, 6)))
     deny(tmp_path / "slice000.dcm")
-    with refused(NoDicomError, "file", "readable", 1):
+    with refused(NoDicomError, "file", "readable", 1):  # file looked at
         read_volume(tmp_path)
 
 
@@ -183,5 +183,5 @@ def test_file_above_the_folder_of_the_slices_is_skipped_with_a_warning_if_it_may
 )
 def test_file_that_is_no_slice_is_refused_alone_as_no_dicom(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
-    with refused(NoDicomError, "DICOM", 1):
+    with refused(NoDicomError, "DICOM", 1):  # file looked at
         read_volume(tmp_path / name)

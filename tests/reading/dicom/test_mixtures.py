@@ -125,7 +125,7 @@ def test_volume_without_the_element_that_another_has_is_listed_as_none(tmp_path)
 
 def test_third_phase_of_two_volumes_is_refused(tmp_path):
     write_volumes(tmp_path, {"AcquisitionNumber": 1}, {"AcquisitionNumber": 2})
-    with refused(UsageError, "phase", "phases", 3, 2):
+    with refused(UsageError, "phase", "phases", 3, 2):  # the third, of two
         read_volume(tmp_path, phase=3)
 
 

@@ -29,6 +29,8 @@ from clrecon.reading.dicom.parse.values import ValueProblem
 
 
 def per_frame(change, only=None):
+    """A change of the groups of each frame, or of `only` one, from 0."""
+
     def spoil(ds):
         for number, groups in enumerate(ds.PerFrameFunctionalGroupsSequence):
             if only is None or number == only:
@@ -38,6 +40,8 @@ def per_frame(change, only=None):
 
 
 def drop(keyword, inner=None, only=2):
+    """Take a group, or an element of it, from a frame: from the third, which messages call frame 3."""
+
     def change(groups):
         if inner is None:
             delattr(groups, keyword)
@@ -48,6 +52,8 @@ def drop(keyword, inner=None, only=2):
 
 
 def put(keyword, only=2, **values):
+    """Give a frame, the third, a group of such values."""
+
     def change(groups):
         setattr(groups, keyword, [item(**values)])
 
@@ -203,7 +209,7 @@ def test_slices_that_each_state_one_frame_are_read(tmp_path):
 
 def test_frames_of_mr_are_refused(tmp_path):
     write_enhanced(tmp_path / "mf", change=lambda ds: setattr(ds, "Modality", "MR"))
-    with refused(NoDicomError, "MR", "CT", 1):
+    with refused(NoDicomError, "MR", "CT", 1):  # series of MR
         read_volume(tmp_path)
 
 
@@ -285,5 +291,5 @@ def test_frames_with_thousands_of_empty_items_are_refused(tmp_path):
 
 def test_header_of_frames_beyond_256_mib_is_refused_without_reading_it(tmp_path):
     long: Any = SimpleNamespace(pixel_offset=2**28 + 1)
-    with refused(ValueProblem, 2**28 + 1, 2**28):
+    with refused(ValueProblem, 2**28 + 1, 2**28):  # bytes, and the most
         multiframe._read_header_bytes(tmp_path / "no file", long)

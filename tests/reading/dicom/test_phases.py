@@ -94,7 +94,7 @@ def test_two_slices_at_each_place_are_listed_as_phases_with_the_element_that_dif
 def test_series_of_two_phases_is_refused_with_their_list(tmp_path, first, second, keyword, values):
     write_phase(tmp_path, 1, **first)
     write_phase(tmp_path, 2, shift=500, **second)
-    with refused(RefusedInputError, "phases", "phase", keyword, 2, 7):
+    with refused(RefusedInputError, "phases", "phase", keyword, 2, 7):  # two phases of seven slices
         read_volume(tmp_path)
 
 
@@ -164,7 +164,7 @@ def test_slices_with_a_time_each_are_phases_by_the_order_of_their_times(tmp_path
 
 def test_two_different_slices_at_one_place_that_no_element_tells_apart_are_refused(tmp_path):
     write_series(tmp_path, Plan(offsets={3: -1.25}))  # slice 3 lies where slice 2 does
-    with refused(RefusedInputError, "duplicate", "slice002.dcm", "slice003.dcm", 1) as refusal:
+    with refused(RefusedInputError, "duplicate", "slice002.dcm", "slice003.dcm", 1) as refusal:  # at one place
         read_volume(tmp_path)
     assert_one_line(refusal.value)
 
@@ -351,7 +351,7 @@ def test_slices_of_equal_pixels_and_another_geometry_are_not_dropped_but_refused
 def test_slices_whose_times_tell_no_passes_apart_are_refused(tmp_path, first, second):
     write_phase(tmp_path, 1, **first)
     write_phase(tmp_path, 2, shift=500, **second)
-    with refused(RefusedInputError, "element", "headers", 2):
+    with refused(RefusedInputError, "duplicate", "element", "headers", 7):  # at seven places
         read_volume(tmp_path)
 
 
@@ -379,7 +379,7 @@ def write_two_volumes(folder, keyword, values, along):
 @BETWEEN
 def test_two_volumes_whose_slices_lie_between_each_other_are_refused_as_phases(tmp_path, keyword, values, along):
     write_two_volumes(tmp_path, keyword, values, along)
-    with refused(RefusedInputError, "phases", "phase", keyword, 2, 1) as refusal:
+    with refused(RefusedInputError, "phases", "phase", keyword, 2) as refusal:
         read_volume(tmp_path)
     assert_one_line(refusal.value)
 
@@ -471,5 +471,5 @@ def test_images_at_one_place_are_listed_with_one_problem(images_at_one_place):
 
 
 def test_phase_beyond_the_images_at_one_place_is_refused(images_at_one_place):
-    with refused(UsageError, "phase", 8, 7):
+    with refused(UsageError, "phase", 8, 7):  # the eighth, of seven images
         read_volume(images_at_one_place[0], phase=8)

@@ -463,5 +463,5 @@ def test_real_uneven_tilted_series_is_reported_with_its_tilt_and_gaps(real_tilte
 
 
 def test_real_segmentation_is_refused_as_a_volume_by_its_modality(real_data):
-    with refused(NoDicomError, "SEG", "CT", 1):
+    with refused(NoDicomError, "SEG", "CT", 1):  # series of SEG
         read_volume(real_data / "seg_and_labels" / "liver.dcm")

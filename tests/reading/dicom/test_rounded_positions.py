@@ -75,7 +75,7 @@ def test_missing_slice_among_rounded_positions_is_refused(tmp_path, lost):
 def test_missing_slice_among_positions_in_whole_millimetres_is_refused(tmp_path, lost):
     """Steps that are a multiple of the unit are not changed by rounding."""
     write_rounded(tmp_path, step=1.0, digits=0, leave_out=(lost,))
-    with refused(RefusedInputError, "slice", "missing", 1):
+    with refused(RefusedInputError, "slice", "missing", 1):  # slice
         read_volume(tmp_path)
 
 
@@ -115,7 +115,7 @@ def test_decimals_of_positions_are_the_most_that_any_of_them_has(tmp_path):
 
 def test_slices_that_rounding_puts_at_one_place_are_refused_with_the_digits(tmp_path):
     write_rounded(tmp_path, step=0.6, digits=0)
-    with refused(RefusedInputError, "decimals", "digits", 0, 0.6):
+    with refused(RefusedInputError, "decimals", "digits", 0, 0.6):  # decimals, and mm between slices
         read_volume(tmp_path)
 
 

@@ -112,7 +112,7 @@ def test_three_letters_of_a_hash_choose_no_series(series_of_7_and_4):
 
 
 def test_start_of_two_uids_is_refused(series_of_7_and_4):
-    with refused(UsageError, 2, "series"):
+    with refused(UsageError, 2, "series"):  # that match
         read_volume(series_of_7_and_4, ROOT)
 
 
@@ -178,7 +178,7 @@ def test_two_faulty_series_of_equal_size_are_refused_though_a_smaller_one_is_usa
         spoil = set_raw("PixelSpacing", "0\\0", only=3)
         write_series(tmp_path, Plan(series=number, shape=(7, 5, 6), name=f"{number}-{{}}".format), spoil)
     write_series(tmp_path, Plan(series=3, shape=(4, 5, 6), name="3-{}".format))
-    with refused(RefusedInputError, "PixelSpacing", 7, 1, 3):
+    with refused(RefusedInputError, "PixelSpacing", 7, "1-3", "2-3"):  # slices of each, and the faulty files
         read_volume(tmp_path)
 
 
@@ -249,7 +249,7 @@ def write_mr(folder):
 
 def test_folder_of_mr_alone_is_refused(tmp_path):
     write_mr(tmp_path)
-    with refused(NoDicomError, "MR", "CT", 1):
+    with refused(NoDicomError, "MR", "CT", 1):  # series of MR
         read_volume(tmp_path)
 
 
@@ -273,7 +273,7 @@ def test_ct_beside_a_larger_series_of_mr_is_read_and_the_mr_refused(tmp_path):
 def test_two_series_of_one_slice_are_refused(tmp_path):
     for number in (1, 2):
         write_series(tmp_path, Plan(series=number, shape=(1, 5, 6), name=f"{number}-{{}}".format))
-    with refused(RefusedInputError, 2, "slice"):
+    with refused(RefusedInputError, 2, "slice"):  # two series
         read_volume(tmp_path)
 
 
@@ -344,7 +344,7 @@ def test_warnings_count_slices_files_and_series_without_naming_them(doe_folder):
 
 def test_refusal_names_files_and_not_the_description_of_the_series(tmp_path):
     write_series(tmp_path, Plan(leave_out=(2,)), set_values(SeriesDescription="Doe, spine"))
-    with refused(RefusedInputError, "slice001.dcm", "slice003.dcm", 1) as refusal:
+    with refused(RefusedInputError, "slice001.dcm", "slice003.dcm", "missing") as refusal:
         read_volume(tmp_path)
     assert "Doe" not in repr(refusal.value)
 
@@ -372,7 +372,7 @@ def test_folder_of_other_files_is_refused_with_their_kinds(tmp_path):
 
 def test_text_named_as_dicom_is_refused(tmp_path):
     (tmp_path / "text.dcm").write_text("DICM " * 100)
-    with refused(NoDicomError, "DICOM", 1):
+    with refused(NoDicomError, "DICOM", "text"):
         read_volume(tmp_path / "text.dcm")
 
 

@@ -72,7 +72,8 @@ def write_coronal_and_axial(folder):
 
 def test_series_of_similar_size_in_different_directions_are_refused_with_their_list(tmp_path):
     write_coronal_and_axial(tmp_path)
-    with refused(RefusedInputError, "CT", 1, 8, "coronal", 2, 6, "axial") as refusal:
+    numbers_and_slices = (1, 8, 2, 6)
+    with refused(RefusedInputError, "CT", "coronal", "axial", *numbers_and_slices) as refusal:
         read_volume(tmp_path)
     listing = list_series(tmp_path)
     assert listing.chosen is None

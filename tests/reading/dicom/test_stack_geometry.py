@@ -156,9 +156,10 @@ def test_slice_with_another_frame_spacing_or_orientation_is_refused(tmp_path, ch
 
 def test_slice_with_another_number_of_rows_is_refused(tmp_path):
     plan = write_series(tmp_path)
-    ds = make_dataset(Plan(shape=(7, 4, 6)), 3)
+    columns, rows = 6, 4  # the others have 5 rows
+    ds = make_dataset(Plan(shape=(7, rows, columns)), 3)
     save_dataset(ds, tmp_path / plan.name(3))
-    with refused(RefusedInputError, "Columns", "Rows", 6, 4):
+    with refused(RefusedInputError, "Columns", "Rows", columns, rows):
         read_volume(tmp_path)
 
 

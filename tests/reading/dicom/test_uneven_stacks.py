@@ -207,7 +207,7 @@ HOLES_AMONG_OTHER_GAPS = pytest.mark.parametrize(
 @HOLES_AMONG_OTHER_GAPS
 def test_hole_that_is_as_wide_as_gaps_elsewhere_is_refused_as_a_missing_slice(tmp_path, plan, missing):
     write_series(tmp_path, plan)
-    with refused(RefusedInputError, "slice", "missing", 1):
+    with refused(RefusedInputError, "slice", "missing", 1):  # in each hole one
         read_volume(tmp_path)
 
 

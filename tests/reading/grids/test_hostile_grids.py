@@ -269,7 +269,7 @@ def test_grid_file_of_one_point_in_time_is_read_as_its_volume(tmp_path, extensio
 @pytest.mark.parametrize("extension", [".nii.gz", ".nrrd", ".mha"])
 def test_grid_file_of_five_points_in_time_is_refused(tmp_path, extension):
     path, _ = write_points_in_time(tmp_path, extension, points=5)
-    with refused(RefusedInputError, 4, 7, 6):
+    with refused(RefusedInputError, 7, 6, 4, 5):  # voxels along each axis, and points in time
         clrecon.read_volume(path)
 
 
@@ -287,14 +287,14 @@ def test_nifti_of_colours_is_refused(tmp_path):
 )
 def test_nrrd_of_several_values_a_voxel_is_refused(tmp_path, channels, header):
     path = write_nrrd(tmp_path / "a.nrrd", np.zeros((4, 6, 7, channels), np.uint8), **header)
-    with refused(RefusedInputError, 4, "axes"):
+    with refused(RefusedInputError, 4, "axes"):  # the values of a voxel are the fourth
         clrecon.read_volume(path)
 
 
 @pytest.mark.parametrize("name", WRITERS)
 def test_grid_file_of_a_single_slice_is_refused(tmp_path, name):
     path = WRITERS[name](tmp_path / name, make_ct((1, 6, 7)), OBLIQUE)
-    with refused(RefusedInputError, 7, 6, 1):
+    with refused(RefusedInputError, 7, 6, 1):  # voxels
         clrecon.read_volume(path)
 
 

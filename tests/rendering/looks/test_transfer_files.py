@@ -358,7 +358,7 @@ def test_wrong_line_of_slicer_text_is_refused_with_its_number_and_field(
 
 def test_slicer_text_that_ends_before_its_colours_is_refused(tmp_path: Path) -> None:
     without_colours = "\n".join(TEXT.splitlines()[:8])
-    with refused(RefusedInputError, "a.vp", 9, "colorTransfer"):
+    with refused(RefusedInputError, "a.vp", 9, "colorTransfer"):  # of line 9
         load_transfer_function(write_file(tmp_path, without_colours, "a.vp"))
 
 
@@ -392,7 +392,7 @@ def test_preset_of_slicer_in_utf_16_is_that_in_utf_8(presets_xml: Path, tmp_path
 
 
 def test_presets_of_slicer_without_a_choice_are_refused_with_their_names(presets_xml: Path) -> None:
-    with refused(UsageError, "CT-One", "CT-Two", 3):
+    with refused(UsageError, "CT-One", "CT-Two", "broken", 3):  # presets
         load_transfer_function(presets_xml)
 
 
@@ -403,13 +403,14 @@ def test_preset_of_slicer_that_is_not_there_is_refused(name: str, presets_xml: P
 
 
 def test_broken_preset_of_slicer_is_refused_with_its_line_and_count(presets_xml: Path) -> None:
-    with refused(RefusedInputError, "broken", "scalarOpacity", 7, 5):
+    line, numbers = 7, 5
+    with refused(RefusedInputError, "broken", "scalarOpacity", line, numbers):
         load_transfer_function(presets_xml, "broken")
 
 
 def test_name_of_two_presets_of_slicer_is_refused(tmp_path: Path) -> None:
     twice = write_file(tmp_path, XML.replace("CT-Two", "CT-One"), "twice.xml")
-    with refused(UsageError, "CT-One", 2):
+    with refused(UsageError, "CT-One", 2):  # of that name
         load_transfer_function(twice, "CT-One")
 
 

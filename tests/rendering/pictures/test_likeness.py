@@ -125,7 +125,7 @@ def test_pictures_that_cannot_be_compared_are_refused(one, other, said):
 
 
 def test_background_that_is_no_colour_is_refused():
-    with refused(UsageError, 0, 255):
+    with refused(UsageError, 0, 255, 300):  # the range, and what is given
         measure_pictures(make_drawn_square(), make_drawn_square(), background=300)
 
 

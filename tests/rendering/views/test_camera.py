@@ -109,7 +109,7 @@ def test_view_of_an_option_is_read_and_said_again(text, view):
 
 
 def test_option_of_three_angles_is_refused():
-    with refused(UsageError, "AZIMUTH", "ELEVATION", 1, 3, 30):
+    with refused(UsageError, "'1,2,3'", "AZIMUTH,ELEVATION"):
         read_view("1,2,3")
 
 
