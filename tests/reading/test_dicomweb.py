@@ -258,8 +258,11 @@ def test_list_that_is_no_dicom_json_is_refused(content: bytes, archive: Archive)
 
 
 def test_more_bytes_than_allowed_are_refused_before_they_arrive(archive: Archive) -> None:
+    announces_2000 = answering(b"", STORED, Content_Length="2000")  # none of them arrives
+    archive.answers = [archive.answer, archive.answer, announces_2000]
+
     with refused(RefusedInputError, archive.host, "TMPDIR"):
-        fetch(archive.url, fetched_bytes=1000)
+        fetch(archive.url, fetched_bytes=1999)
 
 
 def test_endless_answer_is_refused_where_it_has_more_bytes_than_allowed(archive: Archive) -> None:

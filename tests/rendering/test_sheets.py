@@ -38,7 +38,7 @@ def test_line_lies_at_its_mm_in_a_panel() -> None:
     assert sheet.pixel_mm == PIXEL_MM
     rows, columns = pixels_from_centre(sheet.image, RED).T
     assert abs(rows.mean() - 10.0 / PIXEL_MM) <= 1.0  # pixel
-    assert (columns.min(), columns.max()) == pytest.approx((-20.0 / PIXEL_MM, 20.0 / PIXEL_MM), abs=1)
+    assert (columns.min(), columns.max()) == pytest.approx((-20.0 / PIXEL_MM, 20.0 / PIXEL_MM), abs=1)  # pixel
 
 
 def test_circle_lies_at_its_mm_in_a_panel() -> None:

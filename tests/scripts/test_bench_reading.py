@@ -67,7 +67,7 @@ def test_reading_of_a_series_is_timed_against_pydicom_and_simpleitk_warm_and_in_
     assert figures["equal_shapes"]
     assert figures["shapes"]["clrecon"] == list(PLAN.shape)
     assert figures["files"] == PLAN.shape[0]
-    assert 0 < figures["scan_seconds_a_file"]["median"] < 1
+    assert 0 < figures["scan_seconds_a_file"]["median"] < 1  # of small files
 
 
 @pytest.mark.release

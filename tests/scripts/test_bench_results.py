@@ -38,7 +38,7 @@ def test_device_of_a_result_has_a_short_name_for_files(described: dict, name: st
 
 
 def test_results_of_a_folder_are_loaded_by_case_input_and_device(tmp_path: Path) -> None:
-    folder = write_results(tmp_path / "a", make_result())
+    folder = write_results(tmp_path / "a", make_result("isosurface-cold", given="spine149"))  # on `POCL`
     assert list(results.load_results(folder)) == [("isosurface-cold", "spine149", "pocl-3.1-debian")]
 
 
@@ -117,7 +117,7 @@ def test_compare_names_a_folder_that_is_missing(result_folders: dict[str, str], 
 
 
 def test_compare_names_a_ratio_that_the_new_results_lack() -> None:
-    before, after = make_result(), make_result()
+    before, after = make_result(), make_result()  # with the ratio all_threads alone
     after["ratios"] = {}
     key = ("case", "input", "device")
     changes, left_out = compare.compare_results({key: before}, {key: after}, percent=10.0)
@@ -129,7 +129,9 @@ def test_table_has_a_row_for_each_ratio_with_its_times_and_spread(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Results have 1,234,567 triangles, times of 30 and 60 ms, and quartiles 0.1 from the median of a ratio."""
-    folder = write_results(tmp_path / "a", make_result(ratio=2.0), make_result(given="lumbar", ratio=1.5))
+    folder = write_results(
+        tmp_path / "a", make_result(given="spine149", ratio=2.0), make_result(given="lumbar", ratio=1.5)
+    )
     assert bench.main(["table", str(folder)]) == 0
     _, _, *rows = capsys.readouterr().out.splitlines()
     cells = [[cell.strip() for cell in row.strip("|").split("|")] for row in rows]
@@ -165,7 +167,7 @@ def test_row_of_scaling_has_the_coefficients_of_determination_of_its_lines() -> 
 @pytest.fixture
 def cold_and_job(tmp_path: Path) -> Path:
     """Results of two cases, the first with two ratios."""
-    cold, job = make_result(), make_result("main-job")
+    cold, job = make_result("isosurface-cold"), make_result("main-job")
     cold["ratios"]["sequential"] = spread_of(4.0)
     return write_results(tmp_path / "a", cold, job)
 

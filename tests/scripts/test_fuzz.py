@@ -176,7 +176,8 @@ def test_families_get_their_shares_of_the_time_although_their_cases_take_differe
         case = schedule.draw()
         schedule.spend(case, seconds[case.family])
     ratio = schedule.spent["values"] / schedule.spent["environment"]
-    assert ratio == pytest.approx(fuzz.SHARES["values"] / fuzz.SHARES["environment"], rel=0.2)
+    expected = fuzz.SHARES["values"] / fuzz.SHARES["environment"]
+    assert ratio == pytest.approx(expected, rel=0.2)  # one of the five cases of 10 s, more or less
 
 
 def test_schedule_of_no_cases_draws_none() -> None:

@@ -168,6 +168,7 @@ def test_the_axis_and_hole_of_a_tube_are_found_between_the_directions_that_are_t
 
     hole_mm, axes, centre = _look_through(tube @ basis)
 
-    assert np.degrees(np.arccos(axes[2] @ basis[2])) < 0.3
-    assert hole_mm == pytest.approx(12.0 - 1.0, abs=0.5)  # the wall fills the pixels at its rim
-    assert np.abs(centre).max() < 0.5
+    off_deg = np.degrees(np.arccos(axes[2] @ basis[2]))
+    assert off_deg < 0.2  # measured 0.09
+    assert hole_mm == pytest.approx(12.0 - 1.0, abs=0.5)  # the wall fills the pixels at its rim, to half a pixel
+    assert np.abs(centre).max() < 0.1  # mm; measured 0.03

@@ -9,7 +9,7 @@ import os
 import struct
 import warnings
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -295,3 +295,20 @@ def _set_length(head: bytes, length: int) -> bytes:
     if head[4:6].isalpha():
         return head[:6] + struct.pack("<H", min(length, 0xFFFF))
     return head[:4] + struct.pack("<L", min(length, 0xFFFFFFFF))
+
+
+def _count_bytes_read() -> int:
+    """Bytes that this process has read so far; 0 on a system that does not say."""
+    try:
+        counters = Path("/proc/self/io").read_text(encoding="ascii")
+    except OSError:
+        return 0
+    return int(counters.partition("rchar: ")[2].split()[0])
+
+
+@contextlib.contextmanager
+def reads_less_than(most: int) -> Iterator[None]:
+    """Assert that fewer bytes are read in this process."""
+    before = _count_bytes_read()
+    yield
+    assert _count_bytes_read() - before < most

@@ -380,7 +380,7 @@ def test_part_that_alternates_is_a_second_volume_in_two_windows_of_a_long_stack(
     hu = widening_body(48)[16:].astype(np.int16)  # its outline moves beside the part that alternates
     stack = np.concatenate([hu, hu, hu, hu])
     stack[1 : 32 + 48 * (windows - 1) : 2, 44:56, 44:56] += 200
-    likeness = judge_slices(stack, 0.0)
+    likeness = judge_slices(stack, tilt_deg=0.0)
     assert likeness.whole < 1.0
     assert likeness.is_mixed is is_mixed
 

@@ -109,7 +109,8 @@ def test_decimals_of_positions_are_the_most_that_any_of_them_has(tmp_path):
     write_series(tmp_path, Plan(shape=(SLICES, 4, 4)), change)
     report = read_volume(tmp_path).report
     assert not report["uneven"]
-    assert report["spacing_mm"][2] == pytest.approx(0.0105, abs=0.01 / SLICES)
+    last_digit_mm = 0.01
+    assert report["spacing_mm"][2] == pytest.approx(0.0105, abs=last_digit_mm / SLICES)
     assert report["warnings"][0].startswith("positions are written with 2 decimals")
 
 

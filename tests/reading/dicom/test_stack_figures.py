@@ -332,8 +332,8 @@ def test_float_pixels_up_to_a_thousand_million_are_read_and_larger_ones_refused(
     def fill_with(value):
         source: Any = SimpleNamespace(load=lambda header, out: np.array([[0.0, value]]))
         out = np.empty((1, 2))
-        low_and_high = _fill_slice(source, header, out)[1:3]
-        return low_and_high, out.tolist()
+        facts = _fill_slice(source, header, out)
+        return (facts.low, facts.high), out.tolist()
 
     most = sign * 1e9
     assert fill_with(most) == ((min(0.0, most), max(0.0, most)), [[0.0, most]])

