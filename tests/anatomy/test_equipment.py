@@ -49,7 +49,7 @@ def test_hard_equipment_is_removed_but_for_what_lies_in_the_margin_of_the_skin(l
     name, _, _, equipment, cleaned = legs_beside_equipment
     share_left = (cleaned.voxels > 600)[equipment].mean()
     if "skin" in name:
-        assert share_left < 0.2  # the margin of 3 mm around the skin stays as it is
+        assert share_left < 0.2  # the margin of 3 mm around the skin stays: measured 0.16
     else:
         assert share_left == 0.0
 

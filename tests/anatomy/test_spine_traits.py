@@ -142,7 +142,7 @@ def test_cells_are_sure_whose_traits_all_reach_their_bounds_by_the_plain_formula
     from_bounds = [np.abs(traits[name] - least) for name, least in SURE.items()]
     is_clear = np.min(from_bounds, axis=0)[covered] > 1e-5  # no trait is within rounding of its bound
     is_sure = np.all([traits[name] >= least for name, least in SURE.items()], axis=0)[covered]
-    assert is_clear.mean() > 0.6  # measured 1.0
+    assert is_clear.mean() > 0.9  # measured 1.0
     assert np.array_equal(measured.sure[is_clear], is_sure[is_clear])
 
 

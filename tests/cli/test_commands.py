@@ -123,7 +123,7 @@ def test_quiet_mesh_prints_nothing_and_writes_its_file(device: Any, ct: Path, tm
     output = tmp_path / "a.obj"
     assert main(["mesh", str(ct), "-o", str(output), "-q", "--device", str(device.index)]) == 0
     assert printed().is_silent
-    assert output.stat().st_size > 1000  # measured 149,399: a line for each vertex and triangle
+    assert output.stat().st_size > 70_000  # measured 149,399: a line for each vertex and triangle
 
 
 def test_mesh_without_a_report_is_not_measured(device: Any, ct: Path, tmp_path: Path, printed: Printer) -> None:

@@ -111,4 +111,4 @@ def test_pillow_is_imported_by_render_and_not_by_info(tmp_path: Path) -> None:
     if found[1][0] == 5:
         pytest.skip("no OpenCL device")
     assert found == [(0, "False"), (0, "True")]
-    assert (tmp_path / "a.png").stat().st_size > 100  # bytes, so it is no empty file; measured 1293
+    assert (tmp_path / "a.png").stat().st_size > 600  # bytes, so it is no empty file; measured 1293

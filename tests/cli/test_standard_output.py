@@ -105,7 +105,7 @@ def test_cloud_on_standard_output_in_xyz_is_three_coordinates_a_line(device, ct,
     assert run("cloud", ct, "--hu", 200, "-o", "-.xyz", "--device", device.index) == 0
 
     streamed, _ = capfdbinary.readouterr()
-    assert np.loadtxt(io.BytesIO(streamed))[:, :3].shape[0] > 100  # points of a cloud of 2,686
+    assert np.loadtxt(io.BytesIO(streamed))[:, :3].shape[0] > 1000  # points of a cloud of 2,686
 
 
 @pytest.mark.parametrize(

@@ -45,7 +45,7 @@ def ct_without_vtk(without_vtk: None, tmp_path: Path, monkeypatch: pytest.Monkey
 def test_command_that_refines_or_writes_files_of_vtk_writes_its_file_without_it(device: Any, command: str) -> None:
     assert main([*command.split(), "--device", str(device.index)]) == 0
     _, _, _, output, *_ = command.split()
-    assert Path(output).stat().st_size > 10_000  # bytes: thousands of vertices
+    assert Path(output).stat().st_size > 100_000  # bytes; measured 196,884 and more
 
 
 @pytest.mark.usefixtures("ct_without_vtk")
@@ -67,7 +67,7 @@ def test_distances_between_meshes_are_measured_and_drawn_without_vtk(device: Any
         assert main(["mesh", "ct", "-o", output, "--decimate", "0.5", "--device", str(device.index), "-q"]) == 0
     assert main("distance b.ply a.vtp -o e.ply --picture e.png".split()) == 0
     assert Path("e.ply").stat().st_size > Path("b.ply").stat().st_size  # the same mesh with distances
-    assert Path("e.png").stat().st_size > 10_000  # bytes: no empty picture
+    assert Path("e.png").stat().st_size > 100_000  # bytes; measured 217,649
 
 
 @pytest.mark.usefixtures("ct_without_vtk")

@@ -93,7 +93,7 @@ def test_a_crop_of_an_oblique_volume_is_the_smallest_block_that_holds_the_box(ob
     volume, cropped, in_the_box = oblique_crop
     check_places(volume, cropped)
     is_inside = np.isin(cropped.voxels, in_the_box)
-    assert is_inside.sum() == len(in_the_box) > 5  # of 7 x 6 x 9 voxels; measured 36 and 72
+    assert is_inside.sum() == len(in_the_box) > 18  # of 7 x 6 x 9 voxels; measured 36 and 72
     assert is_inside.any(axis=(1, 2)).all(), "every slice is needed"
     assert is_inside.any(axis=(0, 2)).all(), "every row is needed"
     assert is_inside.any(axis=(0, 1)).all(), "every column is needed"

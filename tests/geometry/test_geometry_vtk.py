@@ -206,7 +206,7 @@ def resampled_ramp(request):
 def test_a_resampled_ramp_is_the_ramp_within_the_volume(resampled_ramp):
     volume, image, ijk, expected = resampled_ramp
     is_within = ((ijk >= 0.0) & (ijk <= np.array(volume.shape_ijk) - 1)).all(axis=1)
-    assert is_within.sum() > 1000  # points of the image; measured 5004 to 9013
+    assert is_within.sum() > 2500  # points of the image; measured 5004 to 9013
     assert np.abs(image["HU"] - expected)[is_within].max() <= tolerances.RESAMPLED_RAMP_HU
 
 

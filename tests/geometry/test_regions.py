@@ -33,8 +33,8 @@ def ball(radius: float, steps: tuple[float, float, float]) -> np.ndarray:
 @pytest.mark.parametrize("steps", [(1.0, 1.0, 1.0), (0.5, 0.4, 0.4), (4.0, 0.9, 0.9), (2.0, 3.0, 1.0)])
 @pytest.mark.parametrize("radius_mm", [12.0, 20.0])
 def test_the_width_of_a_ball_is_its_radius(radius_mm, steps):
-    within_a_step_mm = max(2.5, steps[0])
-    assert measure_width(ball(radius_mm, steps), FREE, steps) == pytest.approx(radius_mm, abs=within_a_step_mm)
+    block_mm = max(2.0, *steps)  # in which the width is measured; measured up to 1.24 mm too little
+    assert measure_width(ball(radius_mm, steps), FREE, steps) == pytest.approx(radius_mm, abs=block_mm)
 
 
 def ball_beside_voxels(radius: float, steps: tuple[float, float, float], shift: np.ndarray) -> np.ndarray:
@@ -69,7 +69,7 @@ def test_a_ball_smaller_than_the_limit_by_more_than_a_voxel_does_not_hold_one_of
     assert not holds_ball(ball_beside_voxels(smaller_mm, steps, shift), FREE, steps, LIMIT_MM)
 
 
-WITHIN_TWO_VOXELS = 2.0
+WITHIN_A_BLOCK_MM = 2.0  # measured up to 1.3
 LOW_END_CUT, HIGH_END_CUT = ((True, False), *FREE[1:]), ((False, True), *FREE[1:])
 BOTH_ENDS_CUT, ALL_ENDS_CUT = ((True, True), *FREE[1:]), ((True, True),) * 3
 
@@ -85,7 +85,7 @@ WIDTHS_AT_ENDS = {
 
 @pytest.mark.parametrize(("mask", "ends", "width"), WIDTHS_AT_ENDS.values(), ids=WIDTHS_AT_ENDS)
 def test_a_body_goes_on_beyond_ends_that_the_scan_cuts_and_a_disc_there_counts(mask, ends, width):
-    assert measure_width(mask, ends, ONE_MM) == pytest.approx(width, abs=WITHIN_TWO_VOXELS)
+    assert measure_width(mask, ends, ONE_MM) == pytest.approx(width, abs=WITHIN_A_BLOCK_MM)
 
 
 def test_a_body_that_the_scan_cuts_at_every_end_is_infinitely_wide():

@@ -132,7 +132,7 @@ def test_random_parts_have_the_voxels_and_the_affine_that_nibabel_gives_them(nam
 
 def test_random_ranges_without_a_voxel_are_refused():
     keys = keys_that_leave(voxels=False)
-    assert len(keys) > 15  # of 600 drawn; measured 298
+    assert len(keys) > 150  # of 600 drawn; measured 298
     for key in keys:
         with refused(UsageError, "indices"):
             VOLUMES["oblique"][key]

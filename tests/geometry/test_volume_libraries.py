@@ -305,7 +305,7 @@ def test_a_ramp_in_uneven_slices_is_the_ramp_once_resampled(library, uneven_ramp
     points = even.ijk_to_lps(np.column_stack([i, j, k]))
     ijk = uneven_ramp.lps_to_ijk(points)
     is_within = ((ijk >= 0) & (ijk <= np.array(uneven_ramp.shape_ijk) - 1)).all(axis=1)
-    assert is_within.sum() > 100  # 420 of 1,184 voxels were measured
+    assert is_within.sum() > 200  # 420 of 1,184 voxels were measured
     error = np.abs(even.voxels.ravel() - points @ RAMP_A_MM)[is_within]
     assert error.max() <= 10 * tolerances.RESAMPLED_RAMP_HU  # values of some thousand HU
 
