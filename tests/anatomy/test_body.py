@@ -70,6 +70,7 @@ def test_removing_a_table_leaves_the_given_scan_as_it_is(patient_on_a_table):
 @pytest.mark.parametrize("gap_mm", [25.0])
 def test_a_table_farther_away_than_the_margin_is_removed_as_a_whole(patient_on_a_table):
     volume, _, table = patient_on_a_table
+    assert (volume.voxels[:, table] >= TISSUE_HU).all()
     assert not (remove_table(volume).voxels[:, table] >= TISSUE_HU).any()
 
 

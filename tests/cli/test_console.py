@@ -193,6 +193,7 @@ def test_progress_on_a_narrow_terminal_keeps_its_count(
 def test_quiet_console_shows_no_progress_and_no_warnings_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
     console = Console()
     console.set_loudness(quiet=True, verbose=False)
     console.progress("read", done=5, total=10)

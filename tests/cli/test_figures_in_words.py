@@ -140,10 +140,6 @@ def test_warning_is_printed_unless_it_is_in_the_json_or_quiet(
     assert capsys.readouterr().err == ("clrecon: warning: cold\n" if is_printed else "")
 
 
-def test_new_console_draws_its_first_progress_at_once() -> None:
-    assert Console()._last_draw == 0.0
-
-
 def use_standard_output(**given: Any) -> None:
     """Do what ``clrecon cloud`` does with its options before its work."""
     options = argparse.Namespace(**{"output": "a.stl", "report": None, "json": False, "one_file": False, **given})

@@ -117,6 +117,7 @@ def test_each_row_of_a_list_in_help_begins_a_line(command, rows, narrow, capsys)
 def test_word_with_a_hyphen_stays_whole_in_a_narrow_help(command, narrow, capsys):
     assert main([command, "--help-all"]) == 0
     lines = capsys.readouterr().out.split("\n")
+    assert any("bilateral-2d" in line for line in lines)
     assert not [line for line in lines if line.rstrip().endswith(("bilateral-", "soft-", "non-"))]
 
 

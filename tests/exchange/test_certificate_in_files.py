@@ -192,7 +192,7 @@ def test_warnings_beyond_the_first_twenty_are_counted():
     lines = certificate_lines({"warnings": HOSTILE_WARNINGS})
     assert WARNINGS_WRITTEN == 20
     assert len(lines) == 20 + 1
-    assert lines[-1] == "warning and 14 more, in the report"
+    assert lines[-1] == f"warning and {len(HOSTILE_WARNINGS) - 20} more, in the report"
 
 
 @pytest.mark.parametrize("extension", [".ply", ".obj", ".vtp", ".glb", ".3mf"])

@@ -15,7 +15,7 @@ from clrecon.geometry import Volume
 from clrecon.mesh import Mesh
 from clrecon.rendering.looks.window import WINDOWS
 
-HALF_STEP_HU = 2.0  # of the values on a page
+HALF_STEP_HU = 2.0  # values on a page are -1024 to 3068 HU in steps of 4
 
 
 def make_noise(shape: tuple[int, int, int], affine: np.ndarray) -> Volume:

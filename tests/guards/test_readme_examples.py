@@ -141,7 +141,9 @@ def of_python_page(folder, scan) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    ("name", "shape"), [("spine", (30, 64, 32)), ("slab", (1, 64, 64))], ids=["slices and columns", "one slice"]
+    ("name", "shape"),
+    [("spine", (40 - 10, 64, 48 - 16)), ("slab", (1, 64, 64))],
+    ids=["slices 10 to 39 and columns 16 to 47", "one slice"],
 )
 def test_sliced_volume_of_the_page_on_python_has_the_shape_of_its_slices(of_python_page, name, shape):
     assert of_python_page[name].shape == shape
