@@ -23,7 +23,7 @@ from clrecon.rendering.views.directions import as_point, checked_vector
 from clrecon.system.arguments import DirectionName
 from clrecon.system.text import unknown_name
 from clrecon.viewer.model.objects import ShownObject
-from clrecon.viewer.model.parts import FoundParts, carry_looks
+from clrecon.viewer.model.parts import SMALLER, FoundParts, carry_looks
 from clrecon.viewer.model.state import Color, ShownPart, ViewState
 
 _FIT_PIXELS = 1000
@@ -233,6 +233,20 @@ class ChangingView:
     def toggle_colors(self) -> None:
         """Give every part of scans a colour of its own, or take the colours away."""
         self.color_parts(distinct=not any(each.color for each in self.state.parts if each.kind == "cluster"))
+
+    @property
+    def small_parts(self) -> list[ShownPart]:
+        """The parts of scans that hold all components but the largest."""
+        return [part for part in self.state.parts if part.kind == "cluster" and part.number == SMALLER]
+
+    def toggle_small_parts(self) -> None:
+        """Hide the small components of scans, or show them again."""
+        small = self.small_parts
+        if not small:
+            raise UsageError("no scan has small parts: each component has a row of its own, or none is found yet")
+        visible = not any(part.visible for part in small)
+        parts = tuple(replace(part, visible=visible) if part in small else part for part in self.state.parts)
+        self._change("small parts", "the choice of small parts", parts=parts)
 
     def set_opacity(self, key: str, value: float) -> None:
         """Make a part translucent: 0 to 1; at 0 it is not seen, but stays in the list as shown."""

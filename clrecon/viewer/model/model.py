@@ -446,6 +446,7 @@ class ViewModel(ChangingView):
             "cross_text": self.say_place(state.cross),
             "parts": [each.describe() for each in state.parts],
             "parts_known": self.parts_known,
+            "small_parts": any(part.visible for part in self.small_parts) if self.small_parts else None,
             "tool": state.tool,
             "points": [each.describe() for each in state.points],
             "measures": [

@@ -56,7 +56,10 @@ class ClusterMap(LabelMap):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FoundParts:
-    """The parts of a scan by its number: `labels`, grown by a voxel, and `placed` on its grid; 0 is all else."""
+    """The parts of a scan by its number: `labels`, grown by a voxel, and `placed` on its grid; 0 is all else.
+
+    small_count: Components that are one part together, `SMALLER`.
+    """
 
     scan: int
     iso_value: float
@@ -65,6 +68,7 @@ class FoundParts:
     labels: LabelMap
     placed: ResampledLabels
     parts: tuple[ShownPart, ...]
+    small_count: int = 0
 
 
 def number_at(volume: Volume, numbers: NDArray[Any], point: Point) -> int:
@@ -143,6 +147,7 @@ def find_clusters(
     return FoundParts(
         scan=scan, iso_value=iso_value, table=table, volume=volume, labels=labels,
         placed=ResampledLabels(labels.voxels, True, {}, ()), parts=parts,
+        small_count=max(0, len(sizes) - _MOST_CLUSTERS),
     )  # fmt: skip
 
 

@@ -132,6 +132,7 @@ _model("show_all", "show all parts", "show_all")
 _model("set_color", "colour of a part, 0 to 1; null: its own", "set_color", key=_text, rgb=_or_none(_check_numbers(3)))
 _model("color_parts", "a colour for each part of scans", "color_parts", takes={"distinct": _flag})
 _model("toggle_colors", "a colour for each part of scans, or none", "toggle_colors")
+_model("toggle_small_parts", "hide the small components of scans, or show them", "toggle_small_parts")
 _model("set_opacity", "opacity of a part, 0 to 1", "set_opacity", key=_text, value=_check_number)
 _AT = {"x": _check_number, "y": _check_number, "size": _size}
 _session("pick", "what is seen at a pixel; plane: of a slice", "pick", takes={"plane": _or_none(_text)}, **_AT)
@@ -256,6 +257,7 @@ _SECTIONS: dict[str, dict[str, Key]] = {
         "X": Key("show only the part under the pointer, else the chosen one", {"do": "only_at"}, at_pointer=True),
         "A": Key("show all parts", {"do": "show_all"}),
         "l": Key("a colour for each part", {"do": "toggle_colors"}),
+        "n": Key("small parts hidden, or shown", {"do": "toggle_small_parts"}),
     },
     "Clip": {
         "c": Key("a plane across the view", {"do": "add_clip", "direction": "view"}),

@@ -58,6 +58,9 @@ _SCALE_STEPS = 64
 _MANY_TRIANGLES = 2_000_000
 """Triangles of a mesh above which it is said that pictures take their time."""
 
+_MANY_SMALL = 1_000
+"""Small parts of scans that are most likely noise: scans of 1 to 4 mm have 200 to 1,300 at 200 HU."""
+
 _THUMBNAIL = (128, 96)
 _WORDS = {
     "prepare": "building kernels",
@@ -104,6 +107,7 @@ class ViewSession(Closing):
         self._timing: dict[str, Any] = {}
         self._shown: Rendering | None = None
         self._parts_failed = False
+        self._warned_of_specks = False
         self._closed = False
         self._pictures = Worker("view-pictures", self._failed)
         self._work = Worker("view-work", self._failed, self._changed)
@@ -276,11 +280,20 @@ class ViewSession(Closing):
                     return
                 if parts:
                     self.model.take_parts(parts)
+                    self._warn_of_specks(sum(each.small_count for each in parts))
                 if then is not None:
                     then()
             self._changed()
 
         self._work.ask("parts", find_parts_now, rank=2)
+
+    def _warn_of_specks(self, count: int) -> None:
+        """Say once that many small parts are most likely noise."""
+        if count < _MANY_SMALL or self._warned_of_specks:
+            return
+        self._warned_of_specks = True
+        specks = f"{count:,} small parts, most likely noise (n: hide them)"
+        self._said = specks if self._said is None else f"{specks}; {self._said}"
 
     def set_table(self, shown: bool) -> None:
         """Show the table, or take it away, which takes a moment the first time."""

@@ -243,6 +243,8 @@
     const clusters = now.parts.filter(({ kind }) => kind === "cluster");
     find("colors").hidden = !clusters.length;
     find("colors").setAttribute("aria-pressed", String(clusters.some(({ color }) => color)));
+    find("small").hidden = now.small_parts === null;
+    find("small").setAttribute("aria-pressed", String(now.small_parts === false));
     if (told("measures")) showMeasures();
     if ((told("clips") || told("clip_box")) && !held) showClips();
     if (told("notes") || told("objects") || told("warnings")) showAbout();
@@ -503,6 +505,7 @@
   find("clear").onclick = () => run("clear_measures");
   find("all").onclick = () => run("show_all");
   find("colors").onclick = () => run("toggle_colors");
+  find("small").onclick = () => run("toggle_small_parts");
   find("cut").onclick = () => run("add_clip", { direction: find("direction").value });
   find("boxed").onclick = () => run("toggle_clip_box");
   find("save").onclick = () => save(find("format").value);

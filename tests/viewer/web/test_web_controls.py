@@ -36,8 +36,10 @@ CURVE = (
 )
 
 CONTROLS = {
+    # First: the specks of the scan are gone with its table.
+    "#small": Control("f.small_parts === false", before=(("set_iso", {"hu": -150}), ("find_parts", {}))),
     "#modes [data-mode='mip']": Control("f.mode === 'mip'"),
-    "#table": Control("!f.table", before=(SURFACE, ("set_table", {"shown": True}))),
+    "#table": Control("!f.table", before=(("set_iso", {"hu": 300}), SURFACE, ("set_table", {"shown": True}))),
     "#perspective": Control("!f.camera.parallel"),
     "#fitted": Control("f.fitted", before=(SURFACE, ("set_fitted", {"shown": False}))),
     "#shade": Control("f.color_by === 'thickness'", chosen="thickness"),
