@@ -189,6 +189,7 @@ WORDS_OF_65 = 3
 
 
 def emission_of_20_slices(labels: Any = None, shell: bool = False) -> Any:
+    """What an extraction of voxels knows of a volume of 65 x 7 x 20."""
     return SimpleNamespace(
         volume=SimpleNamespace(shape_ijk=(65, 7, 20)),
         selection=SimpleNamespace(labels=labels, shell=shell),
@@ -197,7 +198,7 @@ def emission_of_20_slices(labels: Any = None, shell: bool = False) -> Any:
 
 
 def test_slab_of_voxels_needs_the_bytes_of_its_buffers():
-    inside = {"volume": 4 * SLICE_OF_65_X_7, "masks": 4 * 4 * 7 * WORDS_OF_65, "rows": (4 + 9) * 4 * 7}
+    inside = {"volume": 4 * SLICE_OF_65_X_7, "masks": 4 * 4 * 7 * WORDS_OF_65, "rows": (4 + 9) * 4 * 7}  # bytes a row
     assert VoxelEmission.needs(emission_of_20_slices(), slices=4) == inside
     assert VoxelEmission.needs(emission_of_20_slices(), slices=4, points=10) == {**inside, "points": 20 * 10}
 
@@ -208,7 +209,7 @@ def test_slab_of_the_shell_of_a_label_needs_the_bytes_of_a_slice_more_at_either_
     assert VoxelEmission.needs(emission, slices=4) == {
         "volume": read * SLICE_OF_65_X_7,
         "masks": 2 * 4 * read * 7 * WORDS_OF_65,  # of the voxels, and of the shell
-        "rows": 4 * read * 7 + 9 * 4 * 7,
+        "rows": 4 * read * 7 + 9 * 4 * 7,  # bytes of rows that are read, and of rows in the slab
         "labels": read * SLICE_OF_65_X_7,
     }
 
@@ -225,6 +226,7 @@ def test_bytes_of_a_slab_of_voxels_are_python_integers():
 
 
 def device(cores: int, has_long_items: bool = True) -> Any:
+    """What planning asks of a device."""
     return SimpleNamespace(compute_units=cores, has_long_items=has_long_items)
 
 
@@ -356,7 +358,7 @@ def test_edge_of_cells_follows_the_density_of_points(k, size):
 
 
 def test_edge_of_cells_of_equal_points_is_one_millimetre():
-    assert choose_cell_edge(np.ones((5, 3), np.float32), 8) == 1.0
+    assert choose_cell_edge(np.ones((5, 3), np.float32), k=8) == 1.0
 
 
 TETRAHEDRON = np.array([[0, 1, 2], [0, 3, 1], [1, 3, 2], [0, 2, 3]])

@@ -121,6 +121,7 @@ def test_a_description_without_voxels_leaves_them_numbers() -> None:
 
 @pytest.fixture
 def three_points() -> PointCloud:
+    """Three points at one place with 1, 2 and 3 HU."""
     return PointCloud(np.zeros((3, 3)), hu=[1, 2, 3], report={"a": 1})
 
 

@@ -97,6 +97,7 @@ def test_a_seed_reports_its_distance_from_the_nearest_point() -> None:
 
 
 def clusters_of(*parts: np.ndarray) -> PointCloud:
+    """A cluster of each part, numbered from 0."""
     labels = np.concatenate([np.full(len(part), number) for number, part in enumerate(parts)])
     return PointCloud(np.concatenate(parts), labels=labels)
 

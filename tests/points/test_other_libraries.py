@@ -105,6 +105,7 @@ def test_bounds_of_no_points_are_nan():
 
 @pytest.fixture(scope="module")
 def thousand_points():
+    """Random points in a cube of 10 mm."""
     return clrecon.PointCloud(np.random.default_rng(6).uniform(0, 10, (1000, 3)))
 
 

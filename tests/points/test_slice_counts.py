@@ -53,9 +53,9 @@ def test_the_report_of_ghost_slices_has_the_figures_of_each_and_the_limits(five_
         "ghost_slices": [
             {
                 "slice": 2,
-                "points": 30,
-                "dice_with_neighbour": 0.4,
-                "dice_of_neighbours": 0.55,
+                "points": VOXELS_OF_SLICES[2],
+                "dice_with_neighbour": 2 * 10 / (30 + 20),
+                "dice_of_neighbours": 2 * 11 / (20 + 20),
                 "share_within_neighbour": round(BEYOND_CHANCE_OF_SLICE_2, 4),
             }
         ],

@@ -15,6 +15,7 @@ SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 
 @pytest.fixture
 def script(monkeypatch):
+    """scripts/gpu_check.py as a module."""
     monkeypatch.syspath_prepend(str(SCRIPTS))
     import gpu_check
 

@@ -7,6 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from clrecon.geometry import Volume
+from clrecon.mesh import Mesh
+
 Arrays = tuple[np.ndarray, np.ndarray]
 
 CUBE_FACES = ((0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5))
@@ -132,3 +135,12 @@ class LongTable:
 
     def __len__(self) -> int:
         return self.rows
+
+
+SHEARED = np.array([[0.7, 0.1, 0.2, -25.0], [-0.1, 0.9, 0.4, -30.0], [0.0, 0.05, 2.5, -84.0], [0, 0, 0, 1.0]])
+"""Affine of a volume in which no step is along an axis."""
+
+
+def placed(mesh: Arrays, on: Volume) -> Mesh:
+    """A mesh in index coordinates, in the mm of a volume."""
+    return Mesh(on.ijk_to_lps(mesh[0]), mesh[1])

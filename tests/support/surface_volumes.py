@@ -44,11 +44,11 @@ def smooth_volume(shape: Sequence[int] = (23, 27, 45), *, affine: np.ndarray = O
 
 
 def assert_sound(mesh: Any) -> None:
-    """Closed, manifold, outward, no zero-area face, every vertex used."""
+    """Closed, manifold, outward, no zero-area face and none twice, every vertex used."""
     quality = mesh.quality()
-    assert quality["closed"] and quality["manifold"]
+    assert quality["closed"] and quality["manifold"] and quality["oriented"]
     assert quality["volume_ml"] > 0.0
-    assert quality["zero_area_faces"] == 0
+    assert (quality["zero_area_faces"], quality["duplicate_faces"]) == (0, 0)
     assert quality["unused_vertices"] == 0
 
 

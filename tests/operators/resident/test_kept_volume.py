@@ -17,11 +17,13 @@ from clrecon.operators.resident.device_volume import DeviceVolume
 
 @pytest.fixture(scope="module")
 def volume():
+    """Smooth random HU in 22 slices of 26 x 45 voxels."""
     return smooth_volume((22, 26, 45))
 
 
 @pytest.fixture(scope="module")
 def labels(volume):
+    """Labels 1 and 2 in two boxes of it, one above the other."""
     return label_boxes(volume, np.s_[3:12, 4:20, 5:30], np.s_[12:20, 4:20, 5:30])
 
 
@@ -125,6 +127,7 @@ class CountedSurfaces:
 
 @pytest.fixture(scope="module")
 def ten_surfaces(volume, device) -> CountedSurfaces:
+    """Of levels from -200 to 250 HU."""
     with pytest.MonkeyPatch.context() as patch:
         return CountedSurfaces(volume, device, patch)
 

@@ -40,6 +40,7 @@ CHECKS = """
 
 
 def noise_volume(shape: tuple[int, int, int]) -> Volume:
+    """Random HU in voxels of 0.7 x 0.7 x 0.8 mm."""
     voxels = np.random.default_rng(5).integers(-1000, 1200, shape).astype(np.int16)
     return Volume(voxels, np.diag([0.7, 0.7, 0.8, 1.0]))
 
@@ -58,7 +59,7 @@ def makes_windows(device) -> bool:
 
 
 @pytest.fixture
-def device_with_windows(device):
+def windowed(device):
     """A device whose compiler makes windows."""
     if not makes_windows(device):
         pytest.skip("this driver's compiler makes no windows")
@@ -79,21 +80,24 @@ def test_windows_are_made_by_compilers_that_know_avx2_alone(device):
 
 
 @pytest.mark.every_device
-def test_a_window_mixes_every_pair_of_neighbours_in_its_row_by_its_weight(device_with_windows):
+def test_a_window_mixes_every_pair_of_neighbours_in_its_row_by_its_weight(windowed):
     rng = np.random.default_rng(2)
     row = np.concatenate([[-32768, 32767, -32768], rng.integers(-32768, 32768, 13)]).astype(np.int16)
     at = np.stack([rng.permutation(15)[:8] for _ in range(200)]).astype(np.int32)
     part = rng.random(at.shape).astype(np.float32)
     part[0], part[1] = 0.0, np.nextafter(np.float32(1.0), np.float32(0.0))
-    values, values_d = empty_output(device_with_windows, at.shape, np.float32)
-    kept = [upload(device_with_windows, array) for array in (row, at, part)]
+    values, values_d = empty_output(windowed, at.shape, np.float32)
+    kept = [upload(windowed, array) for array in (row, at, part)]
     arrays_d = [raw(lent) for lent in kept]
-    build_checks(device_with_windows).look_at_rows(
-        device_with_windows.queue, (len(at),), None, *arrays_d, raw(values_d)
-    )
+    build_checks(windowed).look_at_rows(windowed.queue, (len(at),), None, *arrays_d, raw(values_d))
     low, high = row[at].astype(np.float64), row[at + 1].astype(np.float64)
-    error = np.abs(download(device_with_windows, values, values_d) - (low + part * (high - low)))
+    error = np.abs(download(windowed, values, values_d) - (low + part * (high - low)))
     assert (error <= tolerances.WINDOW_SHARE * np.abs(high - low) + 0.01).all()  # HU: values in float32
+
+
+def leave_windows_out(monkeypatch) -> None:
+    ray_variants = resident.ray_variants
+    monkeypatch.setattr(resident, "ray_variants", lambda *args: {**ray_variants(*args), "NO_WINDOWS": "1"})
 
 
 @pytest.mark.seconds
@@ -102,16 +106,15 @@ def test_a_window_mixes_every_pair_of_neighbours_in_its_row_by_its_weight(device
     daily_rows(3, each_value([14, 16, 17, 40], [ALONG_J, ALONG_K, NEARLY_J], [False, True])),
 )
 def test_pictures_of_random_voxels_are_the_same_with_and_without_windows(
-    device_with_windows, monkeypatch, columns, towards, perspective
+    windowed, monkeypatch, columns, towards, perspective
 ):
     volume = noise_volume((24, 20, columns))
     # A pixel is half a voxel, or more voxels lie beside each other than a window has.
     cameras = [look(volume, towards, half_height=half_height, perspective=perspective) for half_height in (9.0, 60.0)]
     views = [{"camera": camera, "size": (64, 48), "lighting": Lighting()} for camera in cameras]
-    with_windows = [DeviceCaster(device_with_windows)(volume, "dvr", FUNCTION, **view) for view in views]
-    ray_variants = resident.ray_variants
-    monkeypatch.setattr(resident, "ray_variants", lambda *args: {**ray_variants(*args), "NO_WINDOWS": "1"})
-    without = [DeviceCaster(device_with_windows)(volume, "dvr", FUNCTION, **view) for view in views]
+    with_windows = [DeviceCaster(windowed)(volume, "dvr", FUNCTION, **view) for view in views]
+    leave_windows_out(monkeypatch)
+    without = [DeviceCaster(windowed)(volume, "dvr", FUNCTION, **view) for view in views]
     for found, expected in zip(with_windows, without, strict=True):
         assert expected.image[..., 3].max() > 100  # of 255: something is shown; measured 124 on
         assert np.abs(premultiplied(found.image) - premultiplied(expected.image)).max() <= tolerances.RAY_SAME_255
@@ -120,16 +123,13 @@ def test_pictures_of_random_voxels_are_the_same_with_and_without_windows(
 
 @pytest.mark.parametrize("towards", [(1.0, 0.0, 0.0), (1.0, 0.02, 0.03), (0.3, 1.0, 0.02), (0.3, 0.02, 1.0)])
 @pytest.mark.parametrize("shape", [(1, 20, 40), (2, 20, 40), (3, 20, 40), (20, 1, 40), (20, 2, 40), (20, 3, 40)])
-def test_pictures_of_few_rows_or_slices_are_the_same_with_and_without_windows(
-    device_with_windows, monkeypatch, shape, towards
-):
+def test_pictures_of_few_rows_or_slices_are_the_same_with_and_without_windows(windowed, monkeypatch, shape, towards):
     """Inner places lie between the second voxel from each side: of three and fewer there are none."""
     volume = noise_volume(shape)
     view = {"camera": look(volume, towards, half_height=2.0), "size": (32, 32), "lighting": Lighting(), "ray_step": 0.1}
-    found = DeviceCaster(device_with_windows)(volume, "dvr", FUNCTION, **view)
-    ray_variants = resident.ray_variants
-    monkeypatch.setattr(resident, "ray_variants", lambda *args: {**ray_variants(*args), "NO_WINDOWS": "1"})
-    expected = DeviceCaster(device_with_windows)(volume, "dvr", FUNCTION, **view)
+    found = DeviceCaster(windowed)(volume, "dvr", FUNCTION, **view)
+    leave_windows_out(monkeypatch)
+    expected = DeviceCaster(windowed)(volume, "dvr", FUNCTION, **view)
     assert expected.image[..., 3].max() > 100  # of 255: something is shown; measured 124 on
     assert np.abs(premultiplied(found.image) - premultiplied(expected.image)).max() <= tolerances.RAY_SAME_255
     assert np.array_equal(found.depth, expected.depth, equal_nan=True)
@@ -137,14 +137,12 @@ def test_pictures_of_few_rows_or_slices_are_the_same_with_and_without_windows(
 
 @pytest.mark.parametrize("slices", [1, 2, 4, 6])
 @pytest.mark.parametrize("towards", [(0.0, 1.0, 0.0), (0.0, 1.0, 0.1), (0.0, 0.3, -1.0)])
-def test_slabs_with_a_single_slice_at_the_end_give_the_picture_of_the_whole(
-    device_with_windows, monkeypatch, towards, slices
-):
+def test_slabs_with_a_single_slice_at_the_end_give_the_picture_of_the_whole(windowed, monkeypatch, towards, slices):
     volume = noise_volume((13, 20, 40))
     view = {"camera": look(volume, towards, half_height=6.0), "size": (48, 41), "lighting": Lighting(), "ray_step": 0.2}
-    whole = DeviceCaster(device_with_windows)(volume, "dvr", FUNCTION, **view)
+    whole = DeviceCaster(windowed)(volume, "dvr", FUNCTION, **view)
     monkeypatch.setattr(ray_slabs, "plan_ray_slabs", lambda *_, **__: slices)
-    parts = DeviceCaster(device_with_windows)(volume, "dvr", FUNCTION, **view)
+    parts = DeviceCaster(windowed)(volume, "dvr", FUNCTION, **view)
     assert whole.image[..., 3].max() > 100  # of 255: something is shown; measured 253
     assert np.abs(premultiplied(whole.image) - premultiplied(parts.image)).max() <= tolerances.RAY_SAME_255
     for name in ("depth", "expected_depth"):
@@ -183,10 +181,10 @@ import os; os._exit(0)
 
 @pytest.mark.seconds
 @pytest.mark.skipif(sys.platform != "linux", reason="guards of memory are made with Linux's calls")
-def test_no_voxel_beyond_the_volume_is_read(device_with_windows):
+def test_no_voxel_beyond_the_volume_is_read(windowed):
     shapes = ["128,128,32", "512,64,16", "64,64,128", "2,512,512", "512,2,512"]
     done = subprocess.run(
-        [sys.executable, "-c", BETWEEN_GUARDS, str(device_with_windows.index), *shapes],
+        [sys.executable, "-c", BETWEEN_GUARDS, str(windowed.index), *shapes],
         capture_output=True,
         text=True,
         timeout=300,

@@ -28,6 +28,7 @@ def uneven_volume() -> clrecon.Volume:
 
 @pytest.fixture(scope="module")
 def volumes():
+    """The same smooth voxels in even and in uneven slices."""
     return {"even": smooth_volume(SHAPE), "uneven": uneven_volume()}
 
 

@@ -29,11 +29,13 @@ def volume():
 
 @pytest.fixture(scope="module")
 def labels(volume):
+    """Labels 1 and 2 in two boxes of the volume."""
     return label_boxes(volume, np.s_[3:7, 4:12, 3:10], np.s_[7:10, 4:12, 3:10])
 
 
 @pytest.fixture
 def gpu(device):
+    """The device under the name of a GPU, with the device itself as its stand-in."""
     return pretended_gpu(device)
 
 

@@ -32,6 +32,7 @@ from clrecon.proof.surface.surface_checks import CORTEX_CHECKS
 
 
 def fit_surface(volume: Volume, device, level=200.0, constants=None, **options):
+    """The surface at a level, and the walls fitted at its vertices."""
     mesh = extract_isosurface(volume, level, device=device)
     with DeviceVolume(volume, device=device) as resident:
         fit = fit_walls(resident, mesh.vertices, mesh.normals, stopwatch=Stopwatch(), constants=constants, **options)

@@ -270,6 +270,7 @@ def run_mesh_command(*arguments) -> int:
 
 @pytest.fixture
 def ct_file(shell, tmp_path):
+    """The file of the shell."""
     shell.save(tmp_path / "ct.nii.gz")
     return tmp_path / "ct.nii.gz"
 

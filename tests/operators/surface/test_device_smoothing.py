@@ -15,6 +15,7 @@ from clrecon.operators.surface.smoothing import DeviceFilter
 
 
 def rough(vertices: np.ndarray, seed: int = 1) -> np.ndarray:
+    """Vertices with noise of 0.1 mm, in float32."""
     return (vertices + np.random.default_rng(seed).normal(0.0, 0.1, vertices.shape)).astype(np.float32)
 
 

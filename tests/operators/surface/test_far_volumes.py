@@ -146,6 +146,7 @@ def test_smoothing_moves_a_far_mesh_by_half_a_quarter_of_a_voxel_at_most(near_an
 # --- files ---
 @pytest.fixture(scope="module")
 def far_mesh() -> Mesh:
+    """The sphere at `FAR`, by the twin."""
     vertices, normals, triangles = twin.extract_isosurface(make_sphere(FAR), 0.5)
     return Mesh(vertices, triangles, normals)
 

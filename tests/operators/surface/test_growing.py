@@ -122,6 +122,7 @@ LONE_VOXEL_IJK = (69.0, 17.0, 8.0)
 
 @pytest.fixture
 def voxel_of_small_block() -> np.ndarray:
+    """A mask of one voxel of the second of `blocks`."""
     chosen = np.zeros(blocks().voxels.shape, bool)
     chosen[SMALL_BLOCK_KJI] = True
     return chosen
@@ -162,6 +163,7 @@ def test_surface_grown_in_a_small_volume_equals_the_twin(device: Any) -> None:
 
 
 def chosen_of_whole(whole: Any, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and triangles that are left of a mesh of which only some triangles stay."""
     used, left = np.unique(whole.triangles[triangles], return_inverse=True)
     return whole.vertices[used], left.reshape(-1, 3)
 

@@ -258,9 +258,12 @@ def finds_no_surface(device, monkeypatch):
 
 
 @pytest.mark.usefixtures("finds_no_surface")
-def test_a_device_that_finds_no_surface_where_one_must_be_is_refused(device):
-    with refused(DeviceError, "computes", 3, 5):  # the level and the highest value
-        extract_isosurface(random_volume((5, 6, 7), high=6), 3, device=device)
+@pytest.mark.parametrize(
+    ("level", "facts"), [(3, (3, 5)), ((2, 3), (2, 3))], ids=["level, and the highest value", "range"]
+)
+def test_a_device_that_finds_no_surface_where_one_must_be_is_refused(device, level, facts):
+    with refused(DeviceError, "computes", *facts):
+        extract_isosurface(random_volume((5, 6, 7), high=6), level, device=device)
 
 
 @pytest.mark.usefixtures("finds_no_surface")

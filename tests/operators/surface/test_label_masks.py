@@ -8,7 +8,7 @@ import tolerances
 from refusals import refused
 from scipy.spatial import cKDTree
 from slab_surfaces import assert_same
-from surface_volumes import MIRRORED, OBLIQUE, random_labels
+from surface_volumes import MIRRORED, OBLIQUE, assert_sound, random_labels
 from variants import daily, daily_rows
 
 from clrecon.errors import DeviceError, RefusedInputError, UsageError
@@ -42,14 +42,9 @@ def volume_share(mesh) -> float:
 
 
 def enclosed_levels(labels, meshes) -> dict[int, int]:
+    """The levels of labels that others enclose, by their numbers."""
     numbers = find_enclosed(labels, count_faces(labels))
     return {number: round(meshes[number].report["mask_level"] * FULL) for number in numbers}
-
-
-def assert_sound(mesh) -> None:
-    quality = mesh.quality()
-    assert quality["closed"] and quality["manifold"] and quality["oriented"] and quality["volume_ml"] > 0
-    assert quality["zero_area_faces"] == 0 and quality["duplicate_faces"] == 0 and quality["unused_vertices"] == 0
 
 
 @pytest.mark.every_device
@@ -243,6 +238,7 @@ def test_a_hollow_mask_keeps_its_volume_on_any_grid(device, affine):
 
 
 def thin_labels() -> np.ndarray:
+    """A sheet, a line, a single voxel, and a body with a thread: labels 1 to 4."""
     labels = np.zeros((12, 14, 40), np.uint8)
     labels[3, 3:9, 3:20] = 1
     labels[7, 7, 3:20] = 2

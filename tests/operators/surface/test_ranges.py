@@ -10,10 +10,9 @@ from slab_surfaces import assert_same, extract_in_slabs
 from surface_volumes import MIRRORED, OBLIQUE, SHAPES, assert_sound, random_volume, smooth_volume
 from variants import daily, daily_rows
 
-from clrecon.errors import DeviceError, NoSurfaceError, UsageError
+from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.mesh.compare.iso_distance import measure_iso_distances, rule_of_report
-from clrecon.operators.surface import marching_cubes
 from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurface
 from clrecon.proof.surface import extract as twin
 
@@ -256,17 +255,6 @@ def test_a_surface_below_the_lowest_value_is_refused(device):
 def test_a_range_whose_ends_are_one_number_of_float32_is_refused(device):
     with refused(UsageError, "float32"):
         extract_isosurface(random_volume((3, 4, 5), dtype="float32"), (1.0, 1.0 + 1e-12), device=device)
-
-
-def test_a_device_that_finds_no_surface_of_a_range_where_one_must_be_is_refused(device, monkeypatch):
-    def find_nothing(device, slab, *_):
-        mask = np.zeros(slab.mask_rows * slab.grid.words, np.uint32)
-        extents = np.zeros(2 * slab.mask_rows, np.uint16)
-        return marching_cubes.Classified(*(marching_cubes.ocl.upload(device, array) for array in (mask, extents)))
-
-    monkeypatch.setattr(marching_cubes, "classify", find_nothing)
-    with refused(DeviceError, "computes", 2, 3):
-        extract_isosurface(random_volume((5, 6, 7)), (2, 3), device=device)
 
 
 @pytest.mark.parametrize(

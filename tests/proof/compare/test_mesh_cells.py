@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import sample_meshes as samples
 from refusals import refused
+from sample_meshes import SHEARED, placed
 from uneven_volume import uneven
 
 from clrecon.errors import NoSurfaceError, UsageError
@@ -17,7 +18,6 @@ from clrecon.proof.compare.mesh_cells import GridCells, _steps_per_mm, find_mesh
 
 pytestmark = pytest.mark.unit
 
-SHEARED = np.array([[0.7, 0.1, 0.2, -25.0], [-0.1, 0.9, 0.4, -30.0], [0.0, 0.05, 2.5, -84.0], [0, 0, 0, 1.0]])
 
 FAR = SHEARED + np.array([[0.0, 0, 0, 1250.0], [0, 0, 0, -1071.0], [0, 0, 0, 846.0], [0, 0, 0, 0]])
 """Where float32 rounds millimetres to 1e-4."""
@@ -25,10 +25,6 @@ FAR = SHEARED + np.array([[0.0, 0, 0, 1250.0], [0, 0, 0, -1071.0], [0, 0, 0, 846
 
 def grid(shape=(12, 12, 12), affine=None) -> Volume:
     return Volume(np.zeros(shape, np.int16), np.eye(4) if affine is None else affine)
-
-
-def placed(mesh: samples.Arrays, on: Volume) -> Mesh:
-    return Mesh(on.ijk_to_lps(mesh[0]), mesh[1])
 
 
 def cells_of(mesh: samples.Arrays, on: Volume) -> set[tuple[int, ...]]:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import sample_meshes as samples
 from refusals import refused
+from sample_meshes import SHEARED, placed
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
@@ -14,18 +15,12 @@ from clrecon.proof.compare.mesh_slices import measure_slices
 
 pytestmark = pytest.mark.unit
 
-SHEARED = np.array([[0.7, 0.1, 0.2, -25.0], [-0.1, 0.9, 0.4, -30.0], [0.0, 0.05, 2.5, -84.0], [0, 0, 0, 1.0]])
-
 
 def block(affine=None, low=3, high=8, size=12) -> Volume:
     """Voxels of 100 HU from `low` to `high` along each axis, 0 HU around them."""
     voxels = np.zeros((size,) * 3, np.float32)
     voxels[low : high + 1, low : high + 1, low : high + 1] = 100.0
     return Volume(voxels, np.eye(4) if affine is None else affine)
-
-
-def placed(mesh: samples.Arrays, on: Volume) -> Mesh:
-    return Mesh(on.ijk_to_lps(mesh[0]), mesh[1])
 
 
 @pytest.mark.parametrize("affine", [np.eye(4), SHEARED], ids=["even", "sheared"])

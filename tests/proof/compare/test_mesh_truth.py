@@ -9,6 +9,7 @@ import pytest
 import sample_meshes as samples
 import tolerances
 from refusals import refused
+from sample_meshes import SHEARED
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
@@ -19,7 +20,6 @@ from clrecon.proof.phantom import PhantomSettings, phantom_truth
 
 pytestmark = pytest.mark.unit
 
-SHEARED = np.array([[0.7, 0.1, 0.2, -25.0], [-0.1, 0.9, 0.4, -30.0], [0.0, 0.05, 2.5, -84.0], [0, 0, 0, 1.0]])
 CENTRE = np.array([-3.5, -142.25, -418.75])
 RADIUS = 10.0
 
@@ -44,6 +44,7 @@ class Ring:
 
 
 def ball(radius=RADIUS, shift=(0.0, 0.0, 0.0), rounds=5) -> Mesh:
+    """A mesh of the ball around `CENTRE`, or of one beside it."""
     return Mesh(*samples.sphere(centre=CENTRE + shift, radius=radius, rounds=rounds))
 
 

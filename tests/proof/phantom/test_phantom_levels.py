@@ -211,6 +211,7 @@ def test_phantom_is_written_over_an_earlier_one_with_its_label_map(tmp_path: Pat
 
 @pytest.fixture(scope="module")
 def neck() -> dict[str, Vertebra]:
+    """The vertebrae from C1 to C7 by their names."""
     return {vertebra.name: vertebra for vertebra in plan_vertebrae("C1-C7")}
 
 
@@ -253,7 +254,7 @@ def test_transverse_process_of_a_cervical_vertebra_surrounds_its_foramen(neck: d
     vertebra = neck[name]
     beside, along = vertebra.width / 2.0 + 4.4, vertebra.depth / 8.0  # the middle of the foramen, mm
     assert not is_bone(vertebra, beside, along, -1.0)
-    assert is_bone(vertebra, beside, along + 3.6, -1.0)
+    assert is_bone(vertebra, beside, along + 3.6, -1.0)  # behind it and in front of it: it ends 2.5 mm from its middle
     assert is_bone(vertebra, beside, along - 3.4, -1.0)
 
 

@@ -47,9 +47,7 @@ def extra(request: pytest.FixtureRequest) -> dict:
 
 
 @pytest.fixture(scope="module", params=daily(1, ["sphere", "spine"]))
-def written_phantom(
-    request: pytest.FixtureRequest, extra: dict, tmp_path_factory: pytest.TempPathFactory
-) -> SimpleNamespace:
+def series(request: pytest.FixtureRequest, extra: dict, tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     """A phantom as asked for, as told by its truth, and as its files hold it."""
     folder = tmp_path_factory.mktemp("phantom") / "ct"
     settings = PhantomSettings(kind=request.param, **AWKWARD, **extra)
@@ -58,32 +56,26 @@ def written_phantom(
     return SimpleNamespace(folder=folder, settings=settings, truth=truth, hu=hu, affine=affine, headers=headers)
 
 
-def test_written_series_has_the_affine_and_voxels_of_its_truth(written_phantom: SimpleNamespace) -> None:
-    voxels, affine, truth = make_phantom(written_phantom.settings)
-    assert written_phantom.truth == truth == json.loads((written_phantom.folder / "truth.json").read_text())
-    assert np.array_equal(written_phantom.hu, voxels)
+def test_written_series_has_the_affine_and_voxels_of_its_truth(series: SimpleNamespace) -> None:
+    voxels, affine, truth = make_phantom(series.settings)
+    assert series.truth == truth == json.loads((series.folder / "truth.json").read_text())
+    assert np.array_equal(series.hu, voxels)
     assert np.array_equal(affine, truth["affine_ijk_to_lps_mm"])
-    assert written_phantom.affine == pytest.approx(affine, abs=tolerances.PHANTOM_POSITION_MM)
+    assert series.affine == pytest.approx(affine, abs=tolerances.PHANTOM_POSITION_MM)
 
 
-def test_written_series_has_the_size_spacing_and_tilt_of_its_settings(
-    written_phantom: SimpleNamespace, extra: dict
-) -> None:
-    row, column, step = written_phantom.affine[:3, :3].T
+def test_written_series_has_the_size_spacing_and_tilt_of_its_settings(series: SimpleNamespace, extra: dict) -> None:
+    row, column, step = series.affine[:3, :3].T
     normal = np.cross(row, column)
-    assert (
-        list(written_phantom.hu.shape[::-1])
-        == written_phantom.truth["shape_ijk"]
-        == [*AWKWARD["size"], AWKWARD["slices"]]
-    )
+    assert list(series.hu.shape[::-1]) == series.truth["shape_ijk"] == [*AWKWARD["size"], AWKWARD["slices"]]
     along_column, along_row, gap = AWKWARD["spacing"]
     assert [np.linalg.norm(row), np.linalg.norm(column)] == pytest.approx([along_row, along_column])
     assert step @ normal / np.linalg.norm(normal) == pytest.approx(gap, abs=FLOAT64)
-    assert written_phantom.truth["tilt_deg"] == pytest.approx(extra.get("tilt", 0.0), abs=FLOAT64)
+    assert series.truth["tilt_deg"] == pytest.approx(extra.get("tilt", 0.0), abs=FLOAT64)
 
 
-def test_headers_of_a_phantom_are_those_of_a_ct(written_phantom: SimpleNamespace, extra: dict) -> None:
-    first = written_phantom.headers[0]
+def test_headers_of_a_phantom_are_those_of_a_ct(series: SimpleNamespace, extra: dict) -> None:
+    first = series.headers[0]
     assert first.file_meta.TransferSyntaxUID.is_implicit_VR == (extra.get("transfer_syntax") == "implicit")
     assert first.SOPClassUID == pydicom.uid.CTImageStorage
     assert first.PatientPosition == "HFS"
@@ -91,9 +83,9 @@ def test_headers_of_a_phantom_are_those_of_a_ct(written_phantom: SimpleNamespace
     assert ("GantryDetectorTilt" in first) == ("tilt" in extra)
 
 
-def test_slices_of_a_phantom_are_of_one_series_and_have_names_of_their_own(written_phantom: SimpleNamespace) -> None:
-    assert len({header.SOPInstanceUID for header in written_phantom.headers}) == AWKWARD["slices"]
-    assert len({header.SeriesInstanceUID for header in written_phantom.headers}) == 1
+def test_slices_of_a_phantom_are_of_one_series_and_have_names_of_their_own(series: SimpleNamespace) -> None:
+    assert len({header.SOPInstanceUID for header in series.headers}) == AWKWARD["slices"]
+    assert len({header.SeriesInstanceUID for header in series.headers}) == 1
 
 
 def test_decimal_strings_of_a_written_series_have_at_most_16_characters(tmp_path: Path) -> None:

@@ -32,6 +32,7 @@ def place_points(u, v, w) -> np.ndarray:
 
 
 def surface_points(body) -> np.ndarray:
+    """Points all over the surface of a body."""
     turn = np.linspace(0.0, 2.0 * np.pi, 361)[:-1]
     if isinstance(body, Sphere):
         polar = np.linspace(0.0, np.pi, 181)[:, None]

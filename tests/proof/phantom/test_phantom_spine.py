@@ -183,6 +183,7 @@ def test_bone_of_a_vertebra_surrounds_its_canal_and_leaves_it_free(name: str) ->
 
 @pytest.fixture(scope="module")
 def whole_spine() -> Anatomy:
+    """The plan of a spine from C1 to L5 with its ribs."""
     return plan_anatomy(field_of_view_mm=(300.0, 300.0, 450.0), steps_mm=np.eye(3), seed=0)
 
 

@@ -31,6 +31,7 @@ CASES = {
 
 @functools.cache
 def truth_of(case: str) -> PhantomTruth:
+    """The truth of a case of `CASES`."""
     return clrecon.phantom_truth(PhantomSettings(**SMALL, **CASES[case]))
 
 

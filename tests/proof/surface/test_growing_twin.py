@@ -18,6 +18,7 @@ from clrecon.proof.surface.growing import (
 
 
 def inside_masks() -> dict[str, np.ndarray]:
+    """Which samples are inside, by the name of what they show."""
     k, j, i = np.indices((11, 12, 13))
     apart = ((i < 4) | (i > 8)) & (j > 2) & (j < 8) & (k > 2) & (k < 8)
     hollow = (np.abs(np.stack([i - 6, j - 6, k - 5])).max(0) < 5) & (np.abs(np.stack([i - 6, j - 6, k - 5])).max(0) > 1)

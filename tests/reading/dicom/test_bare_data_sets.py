@@ -45,6 +45,7 @@ def cut_meta(data: bytes) -> bytes:
 
 
 def write_cut(folder, files, cut):
+    """A folder of these files, each without what `cut` takes away."""
     folder.mkdir(exist_ok=True)
     for k, data in enumerate(files):
         (folder / f"{k}").write_bytes(cut(data))

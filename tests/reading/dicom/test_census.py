@@ -28,6 +28,7 @@ def numbered(number, *changes, thickness=1.0):
 
 
 def write(folder, change, missing=(), **plan):
+    """24 slices 1 mm apart, some of them missing."""
     return write_series(folder, Plan(shape=(SLICES, 4, 5), **{"gap": 1.0, "leave_out": tuple(missing), **plan}), change)
 
 

@@ -156,7 +156,7 @@ def test_thickness_that_one_slice_does_not_state_is_not_in_the_certificate(tmp_p
         (((0, 2, 0), (0, 0, -3), (-1, 0, 0)), "PIR", True, 0.0),
         (((1, 0, 0), (0, 1, 0), (0, 0, -1)), "LPS", False, 0.0),
         (((0.8, 0.6, 0), (-0.6, 0.8, 0), (0, 0, 1)), "LPS", True, 0.0),
-        (((1, 0, 0), (0, 0.8, 0.6), (0, -0.6, 0.8)), "LPS", True, 36.8698976),
+        (((1, 0, 0), (0, 0.8, 0.6), (0, -0.6, 0.8)), "LPS", True, np.degrees(np.arccos(0.8))),
     ],
 )
 def test_directions_of_the_axes_are_named_by_letters_of_the_patient(steps, axes, right_handed, off_axis):

@@ -17,6 +17,7 @@ IJK = np.array([(0, 0, 0), (2, 3, 5), (9, 7, 6), (15, 15, 11)])
 
 
 def write_damaged(folder, values, body=None):
+    """A series whose elements have these values, or a function's of k; None: they are missing."""
     plan = STACK if body is None else Plan(shape=body.shape)
 
     def change(ds, k):

@@ -15,6 +15,7 @@ from clrecon.jobs.mesh.settings import SCAN_GATE_FAILED
 
 
 def write_damaged(folder, row):
+    """A series with the HU, the plan and the elements of a row."""
     write_values(folder, make_body() if row.hu is None else row.hu, row.plan, **row.values)
     return folder
 

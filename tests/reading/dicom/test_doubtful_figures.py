@@ -129,6 +129,8 @@ def test_one_slice_with_a_negative_slope_fails_the_gate_of_hu_with_a_warning(tmp
 
 # --- bits above HighBit ---
 def set_stored(values, **elements):
+    """A change of the stored values of slice k, shape (5, 6), to `values(stored, k)`."""
+
     def change(ds, k):
         ds.PixelData = values(np.frombuffer(ds.PixelData, "i2").reshape(5, 6).astype(int), k).astype("<u2").tobytes()
         set_values(**elements)(ds, k)

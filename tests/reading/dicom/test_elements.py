@@ -188,6 +188,7 @@ def item(content: bytes, defined: bool = True) -> bytes:
 
 
 def nest(levels: int, implicit: bool = False) -> bytes:
+    """A sequence of undefined length in a sequence, so many levels deep."""
     content = b""
     for _ in range(levels):
         content = encode(

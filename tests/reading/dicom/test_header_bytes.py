@@ -45,6 +45,7 @@ def long_element(tag: int, vr: bytes = b"OB", value: bytes = b"") -> bytes:
 
 
 def check_tail(tail: bytes) -> None:
+    """Look at the bytes behind pixels that end at byte 20."""
     _check_tail(io.BytesIO(bytes(20) + tail), 20, 20 + len(tail), implicit=False, little_endian=True)
 
 
@@ -417,6 +418,7 @@ def test_worker_that_ends_before_it_is_ready_keeps_its_text_only_without_a_decod
 
 
 def parse_three_elements(wanted):
+    """A file with modality, a private element and tube voltage, of which these tags are wanted."""
     meta = element(0x00020010, b"UI", b"1.2.840.10008.1.2.1\0")
     three = element(0x00080060, b"CS", b"CT") + element(0x00090010, b"LO", b"us") + element(0x00180060, b"DS", b"120 ")
     data = bytes(128) + b"DICM" + meta + three + long_element(0x7FE00010, b"OW", bytes(4))
