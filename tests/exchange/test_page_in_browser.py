@@ -31,9 +31,9 @@ def browser():
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
     """A page of a sphere of `RADIUS` about `CENTRE`, and a box to the left of it."""
-    sphere = samples.sphere(tuple(CENTRE), RADIUS, rounds=5)
+    sphere = samples.sphere(tuple(CENTRE), radius=RADIUS, rounds=5)
     path = tmp_path_factory.mktemp("page") / "page.html"
-    mesh = Mesh(*samples.join(sphere, samples.box(tuple(BOX_CORNER), BOX_SIZE)), report={"iso_value_hu": 300.0})
+    mesh = Mesh(*samples.join(sphere, samples.box(tuple(BOX_CORNER), size=BOX_SIZE)), report={"iso_value_hu": 300.0})
     mesh.save(path)
     return path
 
@@ -119,7 +119,7 @@ def test_page_tells_the_iso_value_and_shows_no_message(page):
 @pytest.fixture
 def page_of_walls(browser, tmp_path):
     """A page of a box whose walls are 2 mm thick, on a scale up to 2 mm."""
-    box = Mesh(*samples.box(tuple(BOX_CORNER), BOX_SIZE))
+    box = Mesh(*samples.box(tuple(BOX_CORNER), size=BOX_SIZE))
     box.values = {"thickness_mm": np.full(box.vertex_count, 2.0), "error_mm": np.full(box.vertex_count, np.nan)}
     box.save(tmp_path / "page.html")
     open_page(browser, tmp_path / "page.html")

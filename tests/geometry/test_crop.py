@@ -111,7 +111,7 @@ def test_the_certificate_of_a_crop_has_its_shape_affine_and_range(oblique_crop):
 def test_uneven_slices_of_a_crop_stay_in_their_place(sign):
     voxels = np.arange(6 * 5 * 4, dtype=np.int32).reshape(6, 5, 4)
     volume = uneven(voxels, sign=sign)
-    heights = positions(sign)[:, 2]
+    heights = positions(sign=sign)[:, 2]
     low, high = sorted((heights[1], heights[4]))
     cropped = crop_volume(volume, *between(low - 1, high + 1))
     assert cropped.uneven

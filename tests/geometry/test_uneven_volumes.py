@@ -19,7 +19,7 @@ upwards_and_downwards = pytest.mark.parametrize("sign", [1.0, -1.0], ids=["upwar
 def test_every_voxel_lies_in_its_slice_by_rows_and_columns(sign):
     volume = uneven(sign=sign)
     i, j, k = (axis.ravel() for axis in np.mgrid[:4, :5, :6])
-    expected = positions(sign)[k] + np.stack([i, j], axis=1) @ IN_PLANE.T
+    expected = positions(sign=sign)[k] + np.stack([i, j], axis=1) @ IN_PLANE.T
     assert np.abs(volume.ijk_to_lps(np.stack([i, j, k], axis=1)) - expected).max() <= tolerances.FLOAT64_PLACE_MM
 
 

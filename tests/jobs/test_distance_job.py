@@ -23,7 +23,7 @@ from clrecon.mesh import Mesh
 def files(tmp_path: Path) -> dict[str, str]:
     """Meshes of balls of 10 mm: a.stl, made 2 mm higher at both ends, and b.ply, in RAS, with one centre; a without the
     name of its frame, in RAS; b with a hole of a triangle; and a in metres."""
-    vertices, triangles = ball(10.0, 30)
+    vertices, triangles = ball(10.0, rings=30)
     middle = np.array([40.0, -25.0, -800.0])
     found = {name: str(tmp_path / name) for name in ("a.stl", "b.ply", "plain.stl", "open.stl", "metres.stl")}
     a = Mesh(vertices * (1.0, 1.0, 1.2) + middle, triangles)
@@ -97,7 +97,7 @@ def test_mesh_file_that_names_no_frame_is_read_in_the_given_one_without_a_warnin
 def ball_and_scan(tmp_path: Path) -> tuple[str, str]:
     """A mesh of a ball of 13.5 mm and a scan of a shell of bone of 13 mm about the same centre."""
     hollow_ball(thickness=3.0).save(tmp_path / "ct.nrrd")
-    vertices, triangles = ball(13.5, 30)
+    vertices, triangles = ball(13.5, rings=30)
     Mesh(vertices + MIDDLE, triangles).save(tmp_path / "a.stl")
     return str(tmp_path / "a.stl"), str(tmp_path / "ct.nrrd")
 
@@ -146,7 +146,7 @@ def test_mesh_a_thousand_times_smaller_is_doubted_to_be_in_another_unit(files: d
 @pytest.fixture
 def two_of_one_shape(tmp_path: Path) -> tuple[str, str]:
     """The same mesh in two files that name different frames of reference."""
-    vertices, triangles = ball(5.0, 12)
+    vertices, triangles = ball(5.0, rings=12)
     paths = str(tmp_path / "x.ply"), str(tmp_path / "y.ply")
     for path, code in zip(paths, ("0123456789abcdef", "fedcba9876543210"), strict=True):
         report = {"certificate": {"frame_of_reference_hash": code}}

@@ -28,7 +28,7 @@ def three_boxes() -> Mesh:
     They reach from (500, 0, 0) to (501, 1, 1), from (-3, 2, 1) to (0, 6, 6), and from (9, 9, 9) to (11, 11, 11).
     """
     vertices, triangles = samples.join(
-        samples.box((500, 0, 0)), samples.box((-3, 2, 1), (3, 4, 5)), samples.box((9, 9, 9), (2, 2, 2))
+        samples.box((500, 0, 0)), samples.box((-3, 2, 1), size=(3, 4, 5)), samples.box((9, 9, 9), size=(2, 2, 2))
     )
     order = np.arange(24).reshape(3, 8).T.ravel()  # new place -> old number
     place = np.empty(24, dtype=int)
@@ -46,7 +46,7 @@ def box_rows(number: int) -> np.ndarray:
 
 @pytest.mark.parametrize("edge_mm", [10.0, 20.0])
 def test_volume_of_a_cube_is_exact_in_millilitres(edge_mm):
-    mesh = Mesh(*samples.box((1000, -2000, 500), (edge_mm, edge_mm, edge_mm)))
+    mesh = Mesh(*samples.box((1000, -2000, 500), size=(edge_mm, edge_mm, edge_mm)))
     volume_ml = (edge_mm / 10.0) ** 3
     assert enclosed_ml(mesh.vertices, mesh.triangles) == volume_ml
     assert mesh.quality()["volume_ml"] == volume_ml
@@ -55,7 +55,7 @@ def test_volume_of_a_cube_is_exact_in_millilitres(edge_mm):
 @pytest.mark.parametrize("areas", [True, False], ids=["area", "no area"])
 @pytest.mark.parametrize("volumes", [True, False], ids=["volume", "no volume"])
 def test_area_and_volume_of_a_component_are_measured_where_asked_for_and_else_zero(areas, volumes):
-    mesh = Mesh(*samples.box((1000, -2000, 500), (20.0, 20.0, 20.0)))
+    mesh = Mesh(*samples.box((1000, -2000, 500), size=(20.0, 20.0, 20.0)))
     component_of_triangles = np.zeros(12, np.int64)
     area_mm2, volume_ml = measure_components(
         mesh.vertices, mesh.triangles, component_of_triangles, 1, areas=areas, volumes=volumes
@@ -114,8 +114,8 @@ def test_a_selection_without_limits_returns_the_mesh_itself():
 
 
 def test_the_largest_component_is_that_of_the_largest_area_not_volume():
-    flat = samples.box((0, 0, 0), (40, 40, 0.01))  # 3201.6 mm2, 16 mm3
-    cube = samples.box((100, 0, 0), (10, 10, 10))  # 600 mm2, 1000 mm3
+    flat = samples.box((0, 0, 0), size=(40, 40, 0.01))  # 3201.6 mm2, 16 mm3
+    cube = samples.box((100, 0, 0), size=(10, 10, 10))  # 600 mm2, 1000 mm3
     kept = select_components(Mesh(*samples.join(cube, flat)), keep_largest=1)
     assert kept.quality()["area_mm2"] == pytest.approx(3201.6, rel=tolerances.MESH_VOLUME)
 
@@ -126,7 +126,7 @@ def test_of_components_of_equal_area_the_first_is_kept():
 
 
 def test_a_cavity_is_kept_by_its_volume_without_the_sign():
-    outer, (corners, faces) = samples.box((0, 0, 0), (9, 9, 9)), samples.box((3, 3, 3), (3, 3, 3))
+    outer, (corners, faces) = samples.box((0, 0, 0), size=(9, 9, 9)), samples.box((3, 3, 3), size=(3, 3, 3))
     mesh = Mesh(*samples.join(outer, (corners, faces[:, ::-1])))  # the cavity has -0.027 ml
     assert select_components(mesh, min_volume_ml=0.026) is mesh
     without_cavity = select_components(mesh, min_volume_ml=0.028)
@@ -139,16 +139,16 @@ def test_volume_of_an_open_component_lacks_the_pyramid_over_its_hole_wherever_it
 
     From a point within the cube the pyramid over that face has at most 50 * 10 / 3 mm3, 0.167 ml.
     """
-    vertices, triangles = samples.box((5000, -3000, 800), (10, 10, 10))
+    vertices, triangles = samples.box((5000, -3000, 800), size=(10, 10, 10))
     opened = (vertices, np.delete(triangles, 4, axis=0))
-    mesh = Mesh(*samples.join(opened, samples.box((0, 0, 0), (30, 30, 30))))
+    mesh = Mesh(*samples.join(opened, samples.box((0, 0, 0), size=(30, 30, 30))))
     assert select_components(mesh, min_volume_ml=least_ml).report["components_kept"] == kept
 
 
 def test_a_cube_beside_an_open_component_is_refused_above_its_own_volume():
-    vertices, triangles = samples.box((5000, -3000, 800), (10, 10, 10))
+    vertices, triangles = samples.box((5000, -3000, 800), size=(10, 10, 10))
     opened = (vertices, np.delete(triangles, 4, axis=0))
-    mesh = Mesh(*samples.join(opened, samples.box((0, 0, 0), (30, 30, 30))))
+    mesh = Mesh(*samples.join(opened, samples.box((0, 0, 0), size=(30, 30, 30))))
     with refused(NoSurfaceError, 27):
         select_components(mesh, min_volume_ml=27.1)
 
@@ -287,7 +287,7 @@ def test_the_largest_of_more_components_than_a_piece_has_triangles_is_kept():
     vertices, triangles = samples.box()
     row_of_boxes = (vertices[None] + x_of_boxes[:, None, None] * [1, 0, 0]).reshape(-1, 3)
     faces = (triangles[None] + 8 * np.arange(count)[:, None, None]).reshape(-1, 3)
-    row_of_boxes[8 * large : 8 * large + 8] = samples.box((x_of_boxes[large], 0, 0), (2, 2, 2))[0]
+    row_of_boxes[8 * large : 8 * large + 8] = samples.box((x_of_boxes[large], 0, 0), size=(2, 2, 2))[0]
 
     kept = select_components(Mesh(row_of_boxes, faces), keep_largest=1, min_volume_ml=0.002)
 
@@ -338,12 +338,12 @@ def test_components_that_differ_by_more_than_rounding_are_in_the_order_of_size()
 
 @pytest.mark.parametrize("seed", range(20))
 def test_a_component_of_exactly_the_least_volume_is_kept_wherever_it_lies(seed):
-    vertices, triangles = samples.box((0.05, 0.05, 0.05), (10, 10, 10))
+    vertices, triangles = samples.box((0.05, 0.05, 0.05), size=(10, 10, 10))
     mesh = Mesh(vertices + np.random.default_rng(seed).uniform(-900, 900, 3), triangles)
     assert select_components(mesh, min_volume_ml=1.0) is mesh
 
 
 def test_a_component_a_per_mille_below_the_least_volume_is_removed():
-    one_ml = Mesh(*samples.box((0.05, 0.05, 0.05), (10, 10, 10)))
+    one_ml = Mesh(*samples.box((0.05, 0.05, 0.05), size=(10, 10, 10)))
     with refused(NoSurfaceError, 1.001):
         select_components(one_ml, min_volume_ml=1.001)

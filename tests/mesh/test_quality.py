@@ -210,9 +210,10 @@ def test_quality_does_not_depend_on_the_order_of_vertices_faces_and_corners():
 
 def test_quality_of_a_mesh_that_is_measured_in_pieces_is_that_of_the_whole():
     rings, sides = 250, 131  # 65,500 triangles; a piece holds 16,384
-    quality = measure(samples.torus(rings, sides))
+    quality = measure(samples.torus(rings=rings, sides=sides))
     assert figures(quality, "triangles", "closed", "manifold", "genus") == (2 * rings * sides, True, True, 1)
-    assert quality["volume_ml"] == pytest.approx(samples.torus_volume_ml(rings, sides), rel=tolerances.MESH_VOLUME)
+    expected_ml = samples.torus_volume_ml(rings=rings, sides=sides)
+    assert quality["volume_ml"] == pytest.approx(expected_ml, rel=tolerances.MESH_VOLUME)
 
 
 def test_a_triangle_that_names_a_missing_vertex_is_refused():

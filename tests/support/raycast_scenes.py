@@ -56,7 +56,7 @@ def fill(volume: Volume, field: Field, dtype: Any = np.float32) -> Volume:
     return volume.with_voxels(values.astype(dtype) if np.dtype(dtype).kind == "f" else np.rint(values).astype(dtype))
 
 
-def even_volume(field: Field, steps: str, extent: float, dtype: Any = np.float32) -> Volume:
+def even_volume(field: Field, steps: str, *, extent: float, dtype: Any = np.float32) -> Volume:
     """`field` in a volume of about `extent` mm along each axis."""
     affine = np.eye(4)
     affine[:3, :3], affine[:3, 3] = STEPS[steps], PLACE
@@ -66,6 +66,7 @@ def even_volume(field: Field, steps: str, extent: float, dtype: Any = np.float32
 
 def uneven_volume(
     field: Field,
+    *,
     shape: tuple[int, int] = (66, 52),
     gaps: Sequence[float] | np.ndarray = GAPS,
     sideways: float = 0.3,
@@ -83,15 +84,15 @@ def uneven_volume(
     return fill(Volume(np.zeros((len(table), *shape), np.int8), affine, slice_positions=table), field, dtype)
 
 
-def make_volume(field: Field, grid: str, extent: float = 22.0, dtype: Any = np.float32) -> Volume:
+def make_volume(field: Field, grid: str, *, extent: float = 22.0, dtype: Any = np.float32) -> Volume:
     """`field` in a volume of about `extent` mm along each axis, of one of `GRIDS`."""
     if grid != "uneven":
-        return even_volume(field, grid, extent, dtype)
+        return even_volume(field, grid, extent=extent, dtype=dtype)
     gaps = np.resize((1.0, 1.0, 0.4, 0.4, 1.9, 1.0), int(extent))
-    return uneven_volume(field, (int(1.3 * extent / 0.8), int(extent / 0.7)), gaps, dtype=dtype)
+    return uneven_volume(field, shape=(int(1.3 * extent / 0.8), int(extent / 0.7)), gaps=gaps, dtype=dtype)
 
 
-def ball(radius: float, ramp: float, inside: float = 1000.0, outside: float = -500.0) -> Field:
+def ball(radius: float, ramp: float, *, inside: float = 1000.0, outside: float = -500.0) -> Field:
     """A ball whose edge is smooth over `ramp` mm (3 x^2 - 2 x^3), half way down at `radius`."""
 
     def field(points: np.ndarray) -> np.ndarray:
@@ -125,6 +126,7 @@ def triple(values: Sequence[float] | np.ndarray) -> tuple[float, float, float]:
 def look(
     volume: Volume,
     towards: Sequence[float],
+    *,
     half_height: float,
     perspective: bool = False,
     up: Sequence[float] = (0.1, 0.2, 1.0),
@@ -141,7 +143,13 @@ def look(
 
 
 def ways_through(
-    volume: Volume, camera: Camera, size: tuple[int, int], first: Any = 0.0, last: Any = None, nearest: float = -np.inf
+    volume: Volume,
+    camera: Camera,
+    size: tuple[int, int],
+    *,
+    first: Any = 0.0,
+    last: Any = None,
+    nearest: float = -np.inf,
 ) -> np.ndarray:
     """Length in mm of each ray within the box of voxels `first` to `last` (default: all), half a voxel around them.
 

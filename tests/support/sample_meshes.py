@@ -16,14 +16,14 @@ CUBE_FACES = ((0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 
 """Corner number: bits 0, 1, 2 are x, y, z; each face is counter-clockwise from outside."""
 
 
-def box(low: Sequence[float] = (0.0, 0.0, 0.0), size: Sequence[float] = (1.0, 1.0, 1.0)) -> Arrays:
+def box(low: Sequence[float] = (0.0, 0.0, 0.0), *, size: Sequence[float] = (1.0, 1.0, 1.0)) -> Arrays:
     """A box of 8 vertices and 12 triangles from its lowest corner on."""
     corners = np.array([[c & 1, c >> 1 & 1, c >> 2] for c in range(8)], dtype=np.float64)
     triangles = [[a, b, c] for a, b, c, d in CUBE_FACES] + [[a, c, d] for a, b, c, d in CUBE_FACES]
     return np.array(low) + corners * np.array(size), np.array(triangles)
 
 
-def torus(rings: int = 15, sides: int = 8, major: float = 20.0, minor: float = 6.0) -> Arrays:
+def torus(*, rings: int = 15, sides: int = 8, major: float = 20.0, minor: float = 6.0) -> Arrays:
     """A torus about z: 2 * rings * sides triangles, `major` mm to the middle of its tube of `minor` mm."""
     u, v = np.meshgrid(np.arange(rings), np.arange(sides), indexing="ij")
     a, b = 2 * np.pi * u.ravel() / rings, 2 * np.pi * v.ravel() / sides
@@ -37,7 +37,7 @@ def torus(rings: int = 15, sides: int = 8, major: float = 20.0, minor: float = 6
     return vertices, np.concatenate([np.column_stack([one, two, three]), np.column_stack([one, three, four])])
 
 
-def ball(radius: float, rings: int = 90) -> Arrays:
+def ball(radius: float, *, rings: int = 90) -> Arrays:
     """Return a ball about the origin whose vertices lie on the sphere, `rings` bands from pole to pole."""
     polar = np.linspace(0.0, np.pi, rings + 1)[1:-1, None]
     around = np.linspace(0.0, 2.0 * np.pi, 2 * rings, endpoint=False)
@@ -54,13 +54,13 @@ def ball(radius: float, rings: int = 90) -> Arrays:
     return vertices, np.concatenate(caps)
 
 
-def torus_volume_ml(rings: int = 15, sides: int = 8, major: float = 20.0, minor: float = 6.0) -> float:
+def torus_volume_ml(*, rings: int = 15, sides: int = 8, major: float = 20.0, minor: float = 6.0) -> float:
     """Volume within the triangles of `torus`, from its cross sections: independent of the divergence theorem.
 
     Between two neighbouring half planes lies the ruled solid whose quads are cut along one diagonal; summed over the
     tetrahedra from the axis it is the sum over quads of determinants, here taken with numpy's general routine.
     """
-    vertices, triangles = torus(rings, sides, major, minor)
+    vertices, triangles = torus(rings=rings, sides=sides, major=major, minor=minor)
     return float(np.linalg.det(vertices[triangles]).sum() / 6000.0)
 
 
@@ -96,7 +96,7 @@ def weld(mesh: Arrays) -> Arrays:
     return vertices, number.reshape(-1)[mesh[1]]
 
 
-def sphere(centre: Sequence[float] = (0.0, 0.0, 0.0), radius: float = 10.0, rounds: int = 2) -> Arrays:
+def sphere(centre: Sequence[float] = (0.0, 0.0, 0.0), *, radius: float = 10.0, rounds: int = 2) -> Arrays:
     """Octahedron, each triangle cut in four `rounds` times, corners pushed out to the sphere."""
     vertices = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=np.float64)
     upper = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4]])

@@ -13,16 +13,16 @@ SIDEWAYS = np.array([0.0, 0.3, 0.2, 1.0, 2.5, 2.0])
 """Mm along the columns: no two layers are sheared alike."""
 
 
-def positions(sign: float = 1.0) -> np.ndarray:
+def positions(*, sign: float = 1.0) -> np.ndarray:
     """Places of the six slices, LPS mm; with -1 they run against the normal."""
     normal = np.cross(*IN_PLANE.T)
     normal *= sign / np.linalg.norm(normal)
     return np.array([-120.0, 80.0, -700.0]) + HEIGHTS[:, None] * normal + SIDEWAYS[:, None] * IN_PLANE[:, 1]
 
 
-def uneven(voxels: np.ndarray | None = None, sign: float = 1.0) -> Volume:
+def uneven(voxels: np.ndarray | None = None, *, sign: float = 1.0) -> Volume:
     """A volume of six slices at `positions`, of zeros by default."""
-    table = positions(sign)
+    table = positions(sign=sign)
     affine = np.eye(4)
     affine[:3, :2] = IN_PLANE
     affine[:3, 2] = (table[-1] - table[0]) / (len(table) - 1)

@@ -38,7 +38,7 @@ def make_scan(*, affine: np.ndarray = AFFINE, dtype: Any = np.int16, scale: floa
 
 def make_mesh(*, at: np.ndarray | None = None, radius: float = 4.0) -> Mesh:
     """A ball in front of the scan."""
-    vertices, triangles = ball(radius, 24)
+    vertices, triangles = ball(radius, rings=24)
     return Mesh(vertices + (middle(0) + (0.0, -25.0, 0.0) if at is None else at), triangles)
 
 

@@ -19,7 +19,7 @@ def test_slices_about_a_mesh_are_those_of_the_solid_volume_and_no_more_than_need
     scan = Volume(noise, np.diag([1.0, 1.0, spacing_mm, 1.0]))
     solid = scan.with_voxels(np.where(random.random(noise.shape) < 0.3, np.int16(500), noise))
     solid.report = {"solid": {"filled_hu": 500.0}}
-    vertices, triangles = ball(radius_mm, 10)
+    vertices, triangles = ball(radius_mm, rings=10)
     mesh = Mesh(vertices + (10.0, 8.0, middle_mm), triangles)
 
     part = _remember_filled(scan, solid)([mesh])

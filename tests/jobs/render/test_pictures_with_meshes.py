@@ -26,7 +26,7 @@ from clrecon.system.color_scale import ColorScale
 def files(tmp_path: Path) -> dict[str, Path]:
     """Balls of 5 mm: lps.stl about the origin, ras.ply 12 mm to the patient's left, plain.stl that names no frame; and
     scan.nii, a scan of 40 mm around them."""
-    vertices, triangles = ball(5.0, 12)
+    vertices, triangles = ball(5.0, rings=12)
     found = {name: tmp_path / name for name in ("lps.stl", "ras.ply", "plain.stl", "scan.nii")}
     clrecon.Mesh(vertices, triangles).save(found["lps.stl"])
     clrecon.Mesh(vertices + (12.0, 0.0, 0.0), triangles).save(found["ras.ply"], "ras")

@@ -22,7 +22,7 @@ MIDDLE = np.array([40.0, -25.0, -800.0])
 @pytest.fixture
 def files(tmp_path: Path) -> dict[str, Path]:
     """DOE_JANE.stl, a ball of 10 mm about `MIDDLE` in LPS, and b.ply in RAS, one of 5 mm, 30 mm to the left of it."""
-    vertices, triangles = ball(10.0, 30)
+    vertices, triangles = ball(10.0, rings=30)
     found = {name: tmp_path / name for name in ("DOE_JANE.stl", "b.ply", "none.stl", "empty.ply")}
     Mesh(vertices + MIDDLE, triangles).save(found["DOE_JANE.stl"])
     Mesh(0.5 * vertices + MIDDLE + (30.0, 0.0, 0.0), triangles).save(found["b.ply"], "ras")

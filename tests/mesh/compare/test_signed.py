@@ -30,7 +30,7 @@ def spiky_torus() -> Arrays:
 
 def hollow_box() -> Arrays:
     """A cube of 1 mm with a cavity of half a millimetre, whose wall faces the cavity."""
-    (outer, outer_faces), (inner, inner_faces) = box(), box((0.25, 0.25, 0.25), (0.5, 0.5, 0.5))
+    (outer, outer_faces), (inner, inner_faces) = box(), box((0.25, 0.25, 0.25), size=(0.5, 0.5, 0.5))
     return np.concatenate([outer, inner]), np.concatenate([outer_faces, inner_faces[:, ::-1] + len(outer)])
 
 

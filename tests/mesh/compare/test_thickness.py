@@ -18,7 +18,7 @@ SLAB_MM = np.array([40.0, 30.0, 2.5])
 @pytest.fixture(scope="module")
 def slab():
     """Vertices and triangles of a box of 40 x 30 x 2.5 mm."""
-    vertices, triangles = samples.box(FAR, SLAB_MM)
+    vertices, triangles = samples.box(FAR, size=SLAB_MM)
     return vertices, triangles.astype(np.uint32)
 
 

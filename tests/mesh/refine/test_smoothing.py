@@ -205,7 +205,7 @@ def test_a_torus_keeps_its_volume_and_its_handle():
 def test_no_face_of_a_tiny_box_loses_its_area():
     """Its edges are 4 steps of float32 at 1000 mm long."""
     edge = 2.0**-12
-    box = Mesh(*samples.box((1000, 0, 0), (edge, edge, edge)))
+    box = Mesh(*samples.box((1000, 0, 0), size=(edge, edge, edge)))
     five_times_the_default = 100
     four_thousand_edges = 1.0  # mm: so wide a bound holds no vertex back
     smooth = smooth_mesh(box, iterations=five_times_the_default, max_deviation_mm=four_thousand_edges)
@@ -273,7 +273,7 @@ def test_vertices_without_an_area_around_them_have_the_normal_0_0_1():
 
 def test_vertices_that_stay_in_the_way_at_every_share_of_their_step_are_taken_back_wholly():
     """A corner that would go into a larger box by a whole, a half and a quarter step stays where it was."""
-    vertices, triangles = samples.join(samples.box(), samples.box((1.25, -5, -5), (10, 10, 10)))
+    vertices, triangles = samples.join(samples.box(), samples.box((1.25, -5, -5), size=(10, 10, 10)))
     step = np.zeros((16, 3))
     step[7] = (4.0, 0.0, 0.0)
     moved, taken_back = move_vertices(vertices.astype(np.float32), triangles.astype(np.uint32), step)
@@ -345,7 +345,9 @@ def test_vertices_that_would_stop_in_the_way_back_of_others_are_taken_back_again
     Boxes and walls have blocks of 64 triangles of their own.
     """
     boxes = [samples.box((0.0, 1.5 * number, 0.0)) for number in range(16)]
-    walls = [samples.box((place, 1.5 * number, -1.0), (0.2, 1.4, 3.0)) for place in (4.4, 8.4) for number in range(16)]
+    walls = [
+        samples.box((place, 1.5 * number, -1.0), size=(0.2, 1.4, 3.0)) for place in (4.4, 8.4) for number in range(16)
+    ]
     vertices, triangles = samples.join(*boxes, *walls)
     step = np.zeros((len(vertices), 3))
     step[: 16 * 8, 0] = 8.0
@@ -482,7 +484,7 @@ def test_vertices_at_a_border_stay(sphere_triangles):
 
 def test_a_component_that_loses_its_volume_where_steps_are_taken_back_is_left_as_it_was():
     """A small box beside a wall: one corner cannot move, the others would, and a tenth of the volume would be gone."""
-    box, wall = samples.box(), samples.box((1.25, -5, -5), (10, 10, 10))
+    box, wall = samples.box(), samples.box((1.25, -5, -5), size=(10, 10, 10))
     vertices, triangles = (part.astype(kind) for part, kind in zip(samples.join(box, wall), "fI", strict=True))
     step = np.zeros((16, 3))
     step[:8] = (0.4, 0.0, 0.0)

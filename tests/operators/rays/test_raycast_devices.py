@@ -48,7 +48,7 @@ def scene(volume: Volume, mode: str = "dvr", function: Any = None, /, **settings
     camera = look(
         volume,
         view.get("towards", (0.4, 1.0, -0.3)),
-        view.get("half_height", 10.0),
+        half_height=view.get("half_height", 10.0),
         perspective=view.get("perspective", False),
     )
     return volume, {"mode": mode, "transfer_function": function, "camera": camera, "size": SIZE, **settings}
@@ -63,29 +63,35 @@ def clipped(volume: Volume, *args: Any, **settings: Any) -> tuple[Volume, dict[s
     return scene(volume, *args, clip=cut(volume), **settings)
 
 
+def blobs_of_18_mm(steps: str, **how: Any) -> Volume:
+    return even_volume(blobs, steps, extent=18.0, **how)
+
+
 SCENES: dict[str, Callable[[], tuple[Volume, dict[str, Any]]]] = {
-    "soft": lambda: scene(even_volume(blobs, "anisotropic", 18.0, np.int16), "dvr", SOFT, lighting=LIT),
-    "unlit": lambda: scene(even_volume(blobs, "mirrored", 18.0), "dvr", SOFT, perspective=True, lighting=UNSHADED),
-    "fading": lambda: scene(even_volume(blobs, "oblique", 18.0, np.int16), "dvr", SOFT, lighting=FADING),
-    "fixed light": lambda: scene(even_volume(blobs, "oblique", 18.0), "dvr", SOFT, perspective=True, lighting=FIXED),
-    "steep": lambda: scene(even_volume(blobs, "sheared", 18.0, np.int16), "dvr", STEEP, lighting=LIT, ray_step=0.17),
-    "steep jitter": lambda: clipped(even_volume(blobs, "mirrored", 18.0), "dvr", STEEP, lighting=FIXED, jitter=True),
+    "soft": lambda: scene(blobs_of_18_mm("anisotropic", dtype=np.int16), "dvr", SOFT, lighting=LIT),
+    "unlit": lambda: scene(blobs_of_18_mm("mirrored"), "dvr", SOFT, perspective=True, lighting=UNSHADED),
+    "fading": lambda: scene(blobs_of_18_mm("oblique", dtype=np.int16), "dvr", SOFT, lighting=FADING),
+    "fixed light": lambda: scene(blobs_of_18_mm("oblique"), "dvr", SOFT, perspective=True, lighting=FIXED),
+    "steep": lambda: scene(blobs_of_18_mm("sheared", dtype=np.int16), "dvr", STEEP, lighting=LIT, ray_step=0.17),
+    "steep jitter": lambda: clipped(blobs_of_18_mm("mirrored"), "dvr", STEEP, lighting=FIXED, jitter=True),
     "steep uneven": lambda: scene(uneven_volume(blobs), "dvr", STEEP, lighting=LIT, half_height=20.0, ray_step=0.19),
-    "gradient opacity": lambda: scene(even_volume(blobs, "oblique", 18.0), "dvr", LEVOY, lighting=LIT),
-    "clipped": lambda: clipped(even_volume(blobs, "sheared", 18.0), "dvr", SOFT, lighting=FIXED, perspective=True),
-    "jitter": lambda: scene(even_volume(blobs, "even", 18.0), "dvr", SOFT, lighting=UNSHADED, jitter=True, ray_step=1),
-    "coarse": lambda: scene(even_volume(blobs, "even", 18.0), "dvr", SOFT, lighting=LIT, ray_step=3.1),
+    "gradient opacity": lambda: scene(blobs_of_18_mm("oblique"), "dvr", LEVOY, lighting=LIT),
+    "clipped": lambda: clipped(blobs_of_18_mm("sheared"), "dvr", SOFT, lighting=FIXED, perspective=True),
+    "jitter": lambda: scene(blobs_of_18_mm("even"), "dvr", SOFT, lighting=UNSHADED, jitter=True, ray_step=1),
+    "coarse": lambda: scene(blobs_of_18_mm("even"), "dvr", SOFT, lighting=LIT, ray_step=3.1),
     "uneven": lambda: scene(uneven_volume(blobs), "dvr", SOFT, lighting=LIT, perspective=True, half_height=20.0),
     "uneven clipped": lambda: clipped(uneven_volume(blobs), "dvr", SOFT, lighting=FIXED, towards=(0.2, 0.1, 1.0)),
-    "hollow": lambda: scene(even_volume(ball(3.0, 2.0), "anisotropic", 40.0, np.int16), "dvr", SOFT, lighting=LIT),
-    "mip": lambda: scene(even_volume(noise, "oblique", 12.0, np.int16), "mip"),
-    "minip": lambda: scene(even_volume(noise, "sheared", 12.0, np.int16), "minip", perspective=True),
+    "hollow": lambda: scene(
+        even_volume(ball(3.0, 2.0), "anisotropic", extent=40.0, dtype=np.int16), "dvr", SOFT, lighting=LIT
+    ),
+    "mip": lambda: scene(even_volume(noise, "oblique", extent=12.0, dtype=np.int16), "mip"),
+    "minip": lambda: scene(even_volume(noise, "sheared", extent=12.0, dtype=np.int16), "minip", perspective=True),
     "mip uneven": lambda: scene(uneven_volume(noise), "mip", half_height=20.0),
-    "mip clipped": lambda: clipped(even_volume(blobs, "mirrored", 18.0), "mip", perspective=True),
-    "mean": lambda: scene(even_volume(noise, "oblique", 12.0, np.int16), "mean", perspective=True),
-    "mean clipped": lambda: clipped(even_volume(blobs, "mirrored", 18.0), "mean"),
-    "drr": lambda: scene(even_volume(noise, "oblique", 12.0, np.int16), "drr", perspective=True),
-    "drr clipped": lambda: clipped(even_volume(blobs, "mirrored", 18.0), "drr"),
+    "mip clipped": lambda: clipped(blobs_of_18_mm("mirrored"), "mip", perspective=True),
+    "mean": lambda: scene(even_volume(noise, "oblique", extent=12.0, dtype=np.int16), "mean", perspective=True),
+    "mean clipped": lambda: clipped(blobs_of_18_mm("mirrored"), "mean"),
+    "drr": lambda: scene(even_volume(noise, "oblique", extent=12.0, dtype=np.int16), "drr", perspective=True),
+    "drr clipped": lambda: clipped(blobs_of_18_mm("mirrored"), "drr"),
     "drr uneven": lambda: scene(uneven_volume(blobs), "drr", half_height=20.0),
     "mean uneven": lambda: scene(uneven_volume(blobs), "mean", half_height=20.0),
 }  # fmt: skip

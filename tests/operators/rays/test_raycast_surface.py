@@ -41,7 +41,7 @@ def make_volume(field, steps: str, *, extent: float) -> Volume:
     """`field` in a volume of about `extent` mm along each axis, or in 21 slices that lie unevenly."""
     if steps == "uneven":
         return uneven_volume(field, shape=(34, 30), gaps=GAPS[10:30])
-    return even_volume(field, steps, extent)
+    return even_volume(field, steps, extent=extent)
 
 
 @pytest.mark.parametrize("perspective", daily(1, [False, True]))

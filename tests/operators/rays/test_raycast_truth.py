@@ -359,7 +359,10 @@ def test_uneven_and_even_samplings_of_one_field_look_alike(cast):
 def waves(dtype):
     """Whole HU from 10 to 110, which every voxel type holds."""
     return even_volume(
-        lambda p: np.rint(60.0 + 50.0 * np.sin(p[:, 0] / 2.0) * np.cos(p[:, 1] / 3.0)), "oblique", 12.0, dtype
+        lambda p: np.rint(60.0 + 50.0 * np.sin(p[:, 0] / 2.0) * np.cos(p[:, 1] / 3.0)),
+        "oblique",
+        extent=12.0,
+        dtype=dtype,
     )
 
 

@@ -65,7 +65,7 @@ def test_mean_tells_the_chords_of_a_box(cast, steps, perspective):
         chords = (mean - outside) / (inside - outside) * ways_through(volume, camera, size)
         clear = rays_off_edges(volume, camera, size, low, high)
         assert clear.sum() > 30  # pixels; measured 139 on
-        ways = ways_through(volume, camera, size, low, high)
+        ways = ways_through(volume, camera, size, first=low, last=high)
         assert np.abs(chords[clear] / ways[clear] - 1.0).max() <= tolerances.RAY_CHORD
 
 
@@ -138,11 +138,11 @@ def test_a_radiograph_tells_the_water_in_a_block_beside_padding(cast, steps, per
     for along in ((0.0, 1.0, 0.0), (0.2, 1.0, 0.1), (1.0, 0.2, -0.1), (0.3, 0.2, 1.0)):
         camera = look(volume, STEPS[steps] @ along, half_height=6.0, perspective=perspective)
         water = cast(volume, "drr", camera=camera, size=size).values
-        ways = ways_through(volume, camera, size, low, high)
+        ways = ways_through(volume, camera, size, first=low, last=high)
         clear = rays_off_edges(volume, camera, size, low, high)
         assert clear.sum() > 30  # pixels; measured 139 on
         assert np.abs(water[clear] / ways[clear] - 1.0).max() <= tolerances.RAY_CHORD
-        beside = ways_through(volume, camera, size, low - 1.0, high + 1.0) == 0.0
+        beside = ways_through(volume, camera, size, first=low - 1.0, last=high + 1.0) == 0.0
         assert not water[beside].any()
 
 
@@ -156,7 +156,7 @@ def water_at_45_degrees():
     voxels[4:20, 4:44, 4:44] = 0
     volume = Volume(voxels, np.eye(4))
     columns, half_height, rows = 110, 6.0, 20
-    camera = look(volume, (1.0, 1.0, 0.0), half_height, up=(0.0, 0.0, 1.0))
+    camera = look(volume, (1.0, 1.0, 0.0), half_height=half_height, up=(0.0, 0.0, 1.0))
     across = (np.arange(columns) - 0.5 * (columns - 1)) * 2 * half_height / rows
     way = np.maximum(40.0 * np.sqrt(2.0) - 2.0 * np.abs(across), 0.0)
     off_edges = (np.abs(np.abs(across) - 20.0 * np.sqrt(2.0)) > 1.0) & (np.abs(across) > 1.0)
@@ -201,7 +201,9 @@ def test_extremes_along_axes_are_those_of_numpy(cast, mode, extreme, towards, up
     across, along = (int(np.abs(axis).argmax()) for axis in (right, up))
     size = tuple(int(round(volume.shape_ijk[axis] * spacing[axis] / pixel)) for axis in (across, along))
 
-    shot = cast(volume, mode, camera=look(volume, towards, 0.25 * size[1], up=up), size=size, ray_step=ray_step)
+    shot = cast(
+        volume, mode, camera=look(volume, towards, half_height=0.25 * size[1], up=up), size=size, ray_step=ray_step
+    )
 
     pixels_a_voxel = (spacing / pixel).astype(int)
     row, column = pixels_a_voxel[along], pixels_a_voxel[across]
@@ -218,7 +220,7 @@ def test_extremes_along_axes_are_those_of_numpy(cast, mode, extreme, towards, up
 def random_values(request, cast):
     """Random HU on a grid; highest, mean and lowest values along rays, and mm of each ray through the volume."""
     rng = np.random.default_rng(6)
-    volume = even_volume(lambda p: rng.integers(-1000, 2000, len(p)), request.param, 14.0, np.int16)
+    volume = even_volume(lambda p: rng.integers(-1000, 2000, len(p)), request.param, extent=14.0, dtype=np.int16)
     size = (48, 40)
     camera = look(volume, (0.7, 1.0, -0.4), half_height=14.0, perspective=True)
     shots = [cast(volume, mode, camera=camera, size=size) for mode in ("mip", "mean", "minip")]

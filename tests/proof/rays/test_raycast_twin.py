@@ -198,7 +198,7 @@ def test_colour_opacity_and_depths_of_a_ray_are_the_sums_over_its_samples_writte
         gradient_opacity=list(zip(gradient_nodes, gradient_opacities, strict=True)),
     )
     lighting, step = Lighting(direction=(0.2, -1.0, 0.4)), 0.37
-    camera = look(volume, (0.4, 1.0, 0.2), 4.0, perspective=True)
+    camera = look(volume, (0.4, 1.0, 0.2), half_height=4.0, perspective=True)
     row, column = 1, 2
 
     picture = cast_rays(volume, VolumeLook(function, lighting=lighting, ray_step=step), camera, (3, 3))
@@ -236,7 +236,9 @@ def test_ray_shows_nothing_behind_the_sample_that_makes_it_opaque():
     red, green = (1, 0, 0), (0, 1, 0)  # red fog in front of an opaque green wall
     wall = TransferFunction([(0, *red, 0.4), (400, *red, 0.4), (400, *green, 1), (1000, *green, 1)])
 
-    picture = cast_rays(volume, VolumeLook(wall, lighting=UNSHADED, ray_step=0.5), look(volume, (0, 1, 0), 5.0), (4, 4))
+    picture = cast_rays(
+        volume, VolumeLook(wall, lighting=UNSHADED, ray_step=0.5), look(volume, (0, 1, 0), half_height=5.0), (4, 4)
+    )
 
     assert (picture.rgba[..., 3] >= 0.99).all()  # where a ray ends
     assert (picture.rgba[..., 3] < 1.0).all()  # the wall would make it 1
@@ -246,7 +248,7 @@ def test_ray_shows_nothing_behind_the_sample_that_makes_it_opaque():
 def test_default_step_of_a_ray_is_half_the_smallest_spacing():
     smallest_spacing = np.linalg.norm(STEPS["anisotropic"], axis=0).min()  # 0.45 mm
     volume = even_volume(lambda p: 50.0 * p[:, 1], "anisotropic", extent=12.0)
-    camera = look(volume, (0.3, 1.0, 0.2), 5.0)
+    camera = look(volume, (0.3, 1.0, 0.2), half_height=5.0)
     default, given = (
         cast_rays(volume, Projection("mean", ray_step=step), camera, (6, 6)).values
         for step in (None, smallest_spacing / 2)
@@ -290,7 +292,7 @@ def test_jitter_of_a_pixel_does_not_depend_on_the_size_of_the_picture():
 def test_jitter_lies_within_each_segment_the_last_one_too():
     """Thin fog on a ramp along the ray, all samples at part u of their segments: the sum is known."""
     volume = even_volume(lambda p: p[:, 1], "even", extent=20.0)
-    camera = look(volume, (0.0, 1.0, 0.0), 4.0)
+    camera = look(volume, (0.0, 1.0, 0.0), half_height=4.0)
     thin = TransferFunction([(-12, 1, 1, 1, 0.0), (12, 1, 1, 1, 0.001)])
     step, part = 1.7, jitter_pixels(width=8, height=8)
     opacity = cast_rays(volume, VolumeLook(thin, jitter=True, ray_step=step), camera, (8, 8)).rgba[..., 3]
