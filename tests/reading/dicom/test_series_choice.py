@@ -107,8 +107,9 @@ def test_series_is_chosen_by_the_start_of_its_hash(series_of_7_and_4, wanted):
 
 
 def test_three_letters_of_a_hash_choose_no_series(series_of_7_and_4):
-    with refused(UsageError, "series", 2, 4):
-        read_volume(series_of_7_and_4, hash_of(5)[:3])
+    letters = hash_of(5)[:3]
+    with refused(UsageError, "no", "series", repr(letters)):
+        read_volume(series_of_7_and_4, letters)
 
 
 def test_start_of_two_uids_is_refused(series_of_7_and_4):

@@ -269,6 +269,11 @@ def test_wrong_field_of_a_transfer_file_is_refused_by_its_name_in_one_line(
         ('<!DOCTYPE x [<!ENTITY a "b">]><MRML/>'.encode("utf-16"), ("DOCTYPE", 1)),
         ('<?xml version="1.0" encoding="no-such"?><MRML/>', ("XML",)),
     ],
+    ids=[
+        *("no JSON in line 2, column 12", "NaN", "name twice", "5,000 digits", "deep", "no format", "empty", "a word"),
+        *("no UTF-8 at byte 0", "more than a million bytes", "cut XML", "XML without a preset", "entity"),
+        *("entity in UTF-16", "unknown encoding"),
+    ],
 )
 def test_file_that_is_no_transfer_function_is_refused(
     tmp_path: Path, content: str | bytes, facts: tuple[str | int, ...]
@@ -345,6 +350,10 @@ def test_slicer_text_without_a_diffuse_part_has_that_of_vtk(tmp_path: Path) -> N
         (7, "", (7, "scalarOpacity")),
         (8, "4 0 1 255 nan", (5, 8, "gradientOpacity")),
         (9, "0", (9, "colorTransfer", 0)),
+    ],
+    ids=[
+        *("letter in a number", "diffuse above 1", "4 numbers for 8", "3 numbers, of 2 to a point", "number 4 is x"),
+        *("falls from 50 to 20 HU", "opacity 7 of point 3", "empty", "number 5 is nan", "no colours"),
     ],
 )
 def test_wrong_line_of_slicer_text_is_refused_with_its_number_and_field(

@@ -191,9 +191,16 @@ def test_annotations_leave_the_picture_that_they_are_drawn_from():
 
 
 def test_picture_of_64_pixels_has_room_for_letters_and_scale_bar():
-    picture = make_picture((64, 64))
-    marked = picture.annotated(letters=True, scale_bar=True)
-    assert changed_pixels(picture, marked).any()
+    picture = make_picture((64, 64), camera=PARALLEL)
+    with_letters = picture.annotated(letters=True)
+    letters = changed_pixels(picture, with_letters)
+
+    with_both = picture.annotated(letters=True, scale_bar=True)
+
+    pixel_mm = 2 * PARALLEL.parallel_scale / 64
+    assert letters.any()
+    assert np.array_equal(with_both.image[letters], with_letters.image[letters])  # the bar lies over none
+    assert longest_run_of_ink(with_both, 255).max() == bar_length(64 * pixel_mm) / pixel_mm
 
 
 @pytest.mark.parametrize("caption", ["größe", "\u8179", "T12 \u00b2"])
