@@ -29,7 +29,7 @@ def names(folder: Path) -> list[str]:
 
 
 @pytest.fixture
-def older(tmp_path: Path) -> Path:
+def folder_of_3(tmp_path: Path) -> Path:
     """A folder with three frames of an earlier run."""
     write_animation(frames(3), tmp_path / "turn")
     return tmp_path / "turn"
@@ -37,13 +37,13 @@ def older(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("name", [".", "./", "../turn"])
 def test_animation_into_the_current_folder_is_refused_and_it_stays(
-    name: str, older: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, folder_of_3: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whoever stands in it would stand in a folder that was removed."""
-    monkeypatch.chdir(older)
+    monkeypatch.chdir(folder_of_3)
     with refused(UsageError, "current"):
         check_animation(name)
-    assert len(names(older)) == 3 and os.path.samefile(older, ".")
+    assert len(names(folder_of_3)) == 3 and os.path.samefile(folder_of_3, ".")
 
 
 def test_animation_without_a_name_is_refused_and_nothing_is_written(
@@ -56,21 +56,21 @@ def test_animation_without_a_name_is_refused_and_nothing_is_written(
 
 
 def test_folder_that_is_a_mounted_disk_is_refused_before_anything_is_drawn(
-    older: Path, monkeypatch: pytest.MonkeyPatch
+    folder_of_3: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch, refused(OutputError, "disk", "mounted"):
-        patch.setattr("os.path.ismount", lambda path: os.path.samefile(path, older))
-        check_animation(older)
-    assert len(names(older)) == 3
+        patch.setattr("os.path.ismount", lambda path: os.path.samefile(path, folder_of_3))
+        check_animation(folder_of_3)
+    assert len(names(folder_of_3)) == 3
 
 
 def test_folder_that_is_write_protected_is_refused_before_anything_is_drawn(
-    older: Path, monkeypatch: pytest.MonkeyPatch
+    folder_of_3: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch, refused(OutputError, "write-protected"):
-        patch.setattr("os.access", lambda path, _: not os.path.samefile(path, older))
-        check_animation(older)
-    assert len(names(older)) == 3
+        patch.setattr("os.access", lambda path, _: not os.path.samefile(path, folder_of_3))
+        check_animation(folder_of_3)
+    assert len(names(folder_of_3)) == 3
 
 
 def test_link_that_leads_back_to_itself_is_refused_as_a_folder_of_frames(tmp_path: Path) -> None:
@@ -101,22 +101,22 @@ def test_new_folder_of_frames_has_the_permissions_of_the_umask(tmp_path: Path) -
 
 @pytest.mark.skipif(os.name != "posix", reason="permissions of POSIX")
 @pytest.mark.usefixtures("umask_027")
-def test_folder_of_frames_has_the_permissions_of_the_one_that_it_replaces_from_the_start(older: Path) -> None:
-    older.chmod(0o700)
+def test_folder_of_frames_has_the_permissions_of_the_one_that_it_replaces_from_the_start(folder_of_3: Path) -> None:
+    folder_of_3.chmod(0o700)
 
-    with stage_animation(frames(), older) as staged:
-        (staged_folder,) = (path for path in older.parent.iterdir() if path.name.startswith(".clrecon-"))
+    with stage_animation(frames(), folder_of_3) as staged:
+        (staged_folder,) = (path for path in folder_of_3.parent.iterdir() if path.name.startswith(".clrecon-"))
         assert permissions(staged_folder) == 0o700
         staged.commit()
 
-    assert permissions(older) == 0o700
-    assert names(older) == NAMES
+    assert permissions(folder_of_3) == 0o700
+    assert names(folder_of_3) == NAMES
 
 
 @pytest.mark.parametrize("when", ["before", "after"])
 @pytest.mark.parametrize("place", [1, 2, 3])
 def test_interrupt_between_two_renames_leaves_one_whole_folder(
-    place: int, when: str, older: Path, monkeypatch: pytest.MonkeyPatch
+    place: int, when: str, folder_of_3: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The older folder goes, the new one comes, the older one gets a name to be removed by: none of it alone."""
     true_way, done = os.rename, []
@@ -131,14 +131,14 @@ def test_interrupt_between_two_renames_leaves_one_whole_folder(
 
     monkeypatch.setattr("os.rename", rename)
     with pytest.raises(KeyboardInterrupt):
-        write_animation(frames(2), older)
-    assert names(older.parent) == ["turn"] and names(older) == NAMES
+        write_animation(frames(2), folder_of_3)
+    assert names(folder_of_3.parent) == ["turn"] and names(folder_of_3) == NAMES
     assert len(done) == 3  # renames
 
 
 @pytest.mark.parametrize("place", [1, 2])
 def test_rename_that_fails_leaves_the_older_folder_of_frames(
-    place: int, older: Path, monkeypatch: pytest.MonkeyPatch
+    place: int, folder_of_3: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     true_way, done = os.rename, []
 
@@ -150,8 +150,8 @@ def test_rename_that_fails_leaves_the_older_folder_of_frames(
 
     monkeypatch.setattr("os.rename", rename)
     with refused(OutputError, "turn", "busy"):
-        write_animation(frames(2), older)
-    assert names(older.parent) == ["turn"] and len(names(older)) == 3
+        write_animation(frames(2), folder_of_3)
+    assert names(folder_of_3.parent) == ["turn"] and len(names(folder_of_3)) == 3
 
 
 @pytest.mark.skipif(os.name != "posix", reason="locks of POSIX")

@@ -371,7 +371,9 @@ def test_lines_of_a_statement_are_those_of_it_before_its_body() -> None:
 
 
 def test_equivalent_changes_are_of_lines_that_exist_and_have_a_reason() -> None:
-    for entry in read_equivalents(mutate_python.EQUIVALENTS):
+    entries = read_equivalents(mutate_python.EQUIVALENTS)
+    assert entries
+    for entry in entries:
         lines = (mutate_python.ROOT / entry.file).read_text(encoding="utf-8").splitlines()
         assert entry.before in " ".join(line.strip() for line in lines), entry
         assert entry.before != entry.after and entry.why

@@ -26,7 +26,7 @@ def move_out(folder, names, store):
 
 
 @pytest.fixture
-def plan(tmp_path):
+def plan_of_9(tmp_path):
     """A series of 9 slices in the folder ct."""
     return write_series(tmp_path / "ct", Plan(shape=(9, 5, 6)))
 
@@ -35,15 +35,15 @@ SOME_ARE_LINKS = pytest.mark.parametrize("slices", [[1, 3, 5, 7], [8], [0]], ids
 
 
 @SOME_ARE_LINKS
-def test_series_with_slices_that_are_links_out_of_it_is_refused(tmp_path, plan, slices):
-    move_out(tmp_path / "ct", map(plan.name, slices), tmp_path / "store")
-    with refused(RefusedInputError, plan.name(slices[0]), "follow_links=True"):
+def test_series_with_slices_that_are_links_out_of_it_is_refused(tmp_path, plan_of_9, slices):
+    move_out(tmp_path / "ct", map(plan_of_9.name, slices), tmp_path / "store")
+    with refused(RefusedInputError, plan_of_9.name(slices[0]), "follow_links=True"):
         read_volume(tmp_path / "ct")
 
 
 @SOME_ARE_LINKS
-def test_links_out_of_a_folder_are_counted_in_its_listing_and_fail_the_gate_of_files(tmp_path, plan, slices):
-    move_out(tmp_path / "ct", map(plan.name, slices), tmp_path / "store")
+def test_links_out_of_a_folder_are_counted_in_its_listing_and_fail_the_gate_of_files(tmp_path, plan_of_9, slices):
+    move_out(tmp_path / "ct", map(plan_of_9.name, slices), tmp_path / "store")
     listing = list_series(tmp_path / "ct")
     assert listing.skipped == {"link out of the folder": len(slices)}
     assert f"{len(slices)} skipped: link out of the folder" in listing.warnings
@@ -51,28 +51,28 @@ def test_links_out_of_a_folder_are_counted_in_its_listing_and_fail_the_gate_of_f
 
 
 @SOME_ARE_LINKS
-def test_links_that_are_followed_are_slices_as_others(tmp_path, plan, slices):
-    move_out(tmp_path / "ct", map(plan.name, slices), tmp_path / "store")
+def test_links_that_are_followed_are_slices_as_others(tmp_path, plan_of_9, slices):
+    move_out(tmp_path / "ct", map(plan_of_9.name, slices), tmp_path / "store")
     volume = read_volume(tmp_path / "ct", follow_links=True)
-    assert np.array_equal(volume.voxels, plan.hu())
+    assert np.array_equal(volume.voxels, plan_of_9.hu())
     assert volume.report["warnings"] == []
     assert list_series(tmp_path / "ct", follow_links=True).series[0].slices == 9
     assert len(list_slices(tmp_path / "ct", Selection(follow_links=True))) == 9
 
 
-def test_folder_of_links_alone_is_refused_unless_they_are_followed(tmp_path, plan):
-    move_out(tmp_path / "ct", map(plan.name, range(9)), tmp_path / "store")
+def test_folder_of_links_alone_is_refused_unless_they_are_followed(tmp_path, plan_of_9):
+    move_out(tmp_path / "ct", map(plan_of_9.name, range(9)), tmp_path / "store")
     with refused(NoDicomError, "follow_links=True", 9):
         read_volume(tmp_path / "ct")
-    assert np.array_equal(read_volume(tmp_path / "ct", follow_links=True).voxels, plan.hu())
+    assert np.array_equal(read_volume(tmp_path / "ct", follow_links=True).voxels, plan_of_9.hu())
 
 
 @pytest.fixture
-def with_lost_links(tmp_path, plan):
+def with_lost_links(tmp_path, plan_of_9):
     """The folder of the series, its last slice a link to a file that is not there; and a link to itself."""
     folder = tmp_path / "ct"
-    (folder / plan.name(8)).unlink()
-    os.symlink("../.git/annex/objects/lost", folder / plan.name(8))
+    (folder / plan_of_9.name(8)).unlink()
+    os.symlink("../.git/annex/objects/lost", folder / plan_of_9.name(8))
     os.symlink("round", folder / "round")
     return folder
 
@@ -88,7 +88,7 @@ def test_links_to_files_that_are_not_there_are_counted_in_the_listing(with_lost_
 
 
 @pytest.fixture
-def other(tmp_path):
+def plan_of_7(tmp_path):
     """A second series of 7 slices, in a folder outside of `root`."""
     return write_series(tmp_path / "other", Plan(series=2, shape=(7, 5, 6)))
 
@@ -102,33 +102,33 @@ def link_other(tmp_path, place):
     return root
 
 
-def test_link_to_a_folder_beside_slices_refuses_their_series(tmp_path, plan, other):
+def test_link_to_a_folder_beside_slices_refuses_their_series(tmp_path, plan_of_9, plan_of_7):
     root = link_other(tmp_path, "ct")  # root/ct/more leads to the other series
     with refused(RefusedInputError, "more", "follow_links=True"):
         read_volume(root)
 
 
-def test_link_to_a_folder_apart_from_slices_is_skipped_with_a_warning(tmp_path, plan, other):
+def test_link_to_a_folder_apart_from_slices_is_skipped_with_a_warning(tmp_path, plan_of_9, plan_of_7):
     volume = read_volume(link_other(tmp_path, "."))
-    assert np.array_equal(volume.voxels, plan.hu())
+    assert np.array_equal(volume.voxels, plan_of_9.hu())
     assert volume.report["warnings"] == ["1 skipped: link out of the folder"]
 
 
 @pytest.mark.parametrize("place", ["ct", "."], ids=["beside the slices", "apart"])
-def test_series_in_a_folder_behind_a_link_is_read_where_links_are_followed(tmp_path, plan, other, place):
+def test_series_in_a_folder_behind_a_link_is_read_where_links_are_followed(tmp_path, plan_of_9, plan_of_7, place):
     root = link_other(tmp_path, place)
     assert [series.slices for series in list_series(root, follow_links=True).series] == [9, 7]
-    assert np.array_equal(read_volume(root, series=2, follow_links=True).voxels, other.hu())
+    assert np.array_equal(read_volume(root, series=2, follow_links=True).voxels, plan_of_7.hu())
 
 
-def test_followed_links_that_lead_back_are_left_and_no_file_is_read_twice(tmp_path, plan):
+def test_followed_links_that_lead_back_are_left_and_no_file_is_read_twice(tmp_path, plan_of_9):
     store = tmp_path / "store"
-    move_out(tmp_path / "ct", [plan.name(0)], store)
+    move_out(tmp_path / "ct", [plan_of_9.name(0)], store)
     os.symlink(store / "object0", tmp_path / "ct" / "again")
     os.symlink(store, tmp_path / "ct" / "objects")
     os.symlink(tmp_path, tmp_path / "ct" / "up")  # leads back to the folder itself
     os.symlink(tmp_path / "ct", store / "back")
     volume = read_volume(tmp_path / "ct", follow_links=True)
-    assert np.array_equal(volume.voxels, plan.hu())
+    assert np.array_equal(volume.voxels, plan_of_9.hu())
     assert volume.report["files"]["found"] == 9
     assert volume.report["dropped"] == {}

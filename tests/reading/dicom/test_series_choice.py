@@ -199,7 +199,7 @@ def test_multi_frame_image_without_places_of_its_frames_counts_as_one_slice(tmp_
         read_volume(tmp_path, series=2)
 
 
-def test_a_localizer_in_the_series_is_parted(tmp_path):
+def test_localizer_in_the_series_is_left_out_with_a_warning(tmp_path):
     plan = write_series(tmp_path)
     scout = make_dataset(Plan(shape=(1, 9, 9)), 0)
     scout.ImageType = ["ORIGINAL", "PRIMARY", "LOCALIZER"]
