@@ -38,7 +38,10 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
         "two phases or times in one series: refused with their list; --phase",
         (TRAPS, "reading/dicom/test_phases.py::test_series_of_two_phases_is_refused_with_their_list"),
     ),
-    11: ("localizer in the series: left out and told", (TRAPS, SERIES + "test_localizer_in_the_series_is_left_out_with_a_warning")),
+    11: (
+        "localizer in the series: left out and told",
+        (TRAPS, SERIES + "test_localizer_in_the_series_is_left_out_with_a_warning"),
+    ),
     12: (
         "two series or patients: refused with their list; --series",
         (
