@@ -17,7 +17,7 @@ from clrecon.mesh import Mesh
 pytestmark = pytest.mark.unit
 
 
-def test_arrays_of_the_right_type_are_not_copied():
+def test_arrays_of_float32_and_uint32_are_not_copied():
     vertices = np.zeros((3, 3), np.float32)
     triangles = np.array([[0, 1, 2]], np.uint32)
     mesh = Mesh(vertices, triangles, normals=vertices)

@@ -116,7 +116,7 @@ def test_a_plane_below_a_mesh_leaves_it_whole() -> None:
 
 
 def test_a_plane_above_a_mesh_that_leaves_nothing_is_refused_with_its_distance() -> None:
-    with refused(NoSurfaceError, 3, "mesh"):
+    with refused(NoSurfaceError, 7 - 4, "mesh"):
         box_1x2x4().clip((0, 0, 7), UP)
 
 

@@ -109,12 +109,12 @@ def test_components_of_an_empty_mesh_are_refused() -> None:
 @pytest.mark.parametrize(
     ("vertices", "triangles", "facts"),
     [
-        (np.eye(3), [[0, 1, 2], [0, 1, 7]], (1, 7, 3)),
-        (np.eye(3), [[1, 2, 3]], (0,)),
-        (np.zeros((0, 3)), [[0, 0, 0]], (0,)),
-        ([[0, 0, 0], [0, np.nan, 0], [1, 1, 1]], [[0, 1, 2]], (1,)),
-        ([[0, 0, 0], [0, 0, np.inf], [1, 1, 1]], [], (1,)),
-        (np.eye(3), [0, 1, 2], (3,)),
+        (np.eye(3), [[0, 1, 2], [0, 1, 7]], ("triangle", 1, "vertex", 7, 3)),
+        (np.eye(3), [[1, 2, 3]], ("triangle", 0, "vertex", 3)),
+        (np.zeros((0, 3)), [[0, 0, 0]], ("triangle", "vertex", 0)),
+        ([[0, 0, 0], [0, np.nan, 0], [1, 1, 1]], [[0, 1, 2]], ("vertex", 1, "finite")),
+        ([[0, 0, 0], [0, 0, np.inf], [1, 1, 1]], [], ("vertex", 1, "finite")),
+        (np.eye(3), [0, 1, 2], ("triangles", "shape", 3)),
         (np.eye(3), [[0.0, 1.0, 2.0]], ("integers",)),
         (np.eye(3), [[True, False, True]], ("integers",)),
         (np.eye(3) * 1j, [[0, 1, 2]], ("vertices",)),

@@ -135,7 +135,7 @@ def test_points_of_a_label_above_255_are_its_voxels(device):
 
 @pytest.mark.parametrize("kind", ["voxels", "shell"])
 @pytest.mark.parametrize("volume_is", ["uneven", "labelled"])
-def test_slabs_give_the_same_points_bit_for_bit(device, volume_is, kind):
+def test_points_found_in_slabs_are_those_of_the_whole_volume_bit_for_bit(device, volume_is, kind):
     shape = (23, 20, 50)
     volume = make_volume(shape, uneven=volume_is == "uneven")
     numbers = np.random.default_rng(3).integers(0, 2, shape).astype(np.uint8)
@@ -383,7 +383,7 @@ def test_extraction_that_finds_no_point_is_an_error(device, choice, words):
         ({"iso_value": 5, "paper": True}, "paper=True places voxels"),
     ],
 )
-def test_wrong_arguments_are_refused(choice, words):
+def test_choices_of_points_that_contradict_themselves_are_refused(choice, words):
     with pytest.raises(UsageError, match=words):
         extract_points(make_volume((3, 5, 33)), **choice)
 

@@ -139,7 +139,7 @@ def write(device, to_d, from_d, size):
     pyopencl.enqueue_copy(device.queue, raw(to_d), raw(from_d), byte_count=size).wait()
 
 
-def test_slabs_give_the_same_field_bit_for_bit(device):
+def test_field_filled_in_slabs_is_that_of_the_whole_bit_for_bit(device):
     cloud, settings = sphere_cloud(3000, radius=12.0), settings_of_spacing(0.5)
     whole = NodeField(device, cloud, cloud.normals, settings)
     assert len(whole.slabs) == 1

@@ -15,7 +15,7 @@ from clrecon.geometry import Volume
 from clrecon.operators.points import free_clusters as module
 from clrecon.operators.points.clusters import cluster_points
 from clrecon.operators.points.free_clusters import ClusterSearch, cluster_free_points, find_clusters, plan_cells
-from clrecon.operators.points.grid import fill_grid
+from clrecon.operators.points.grid import MOST_CELLS_ALONG, fill_grid
 from clrecon.points import PointCloud
 from clrecon.proof.points import clusters as grid_twin
 from clrecon.proof.points import clusters as twin
@@ -65,7 +65,7 @@ def test_clustering_leaves_the_points_as_they_are(device):
 
 
 @pytest.mark.parametrize("per_chunk", [32, 64, 640])
-def test_clusters_are_the_same_in_chunks_of_any_size(device, kernel_form, per_chunk):
+def test_labels_of_clusters_found_in_chunks_of_any_size_equal_the_twin(device, kernel_form, per_chunk):
     points = scattered_points(4000, size=BOX, seed=2)
     labels, *_ = find_clusters(device, plan_cells(points, eps=1.0), eps=1.0, min_samples=3, per_chunk=per_chunk)
     _, expected, _ = twin.cluster_points(points, eps=1.0, min_samples=3)
@@ -100,7 +100,7 @@ def test_cells_of_far_points_are_smaller_by_the_rounding_of_their_coordinates():
 
 
 def test_points_too_far_apart_for_cells_of_eps_are_refused():
-    with refused(UsageError, 0, "cells"):
+    with refused(UsageError, MOST_CELLS_ALONG, "cells"):
         plan_cells([[0.0, 0.0, 0.0], [1e7, 0.0, 0.0]], eps=1.0)
 
 
@@ -269,7 +269,7 @@ def test_points_of_two_coordinates_are_refused(device):
 def test_points_that_are_not_finite_are_refused_with_their_number(device):
     points = scattered_points(100)
     points[7] = np.nan
-    with refused(UsageError, 1, 100):
+    with refused(UsageError, 1, 100):  # one of a hundred points
         cluster_free_points(points, 1.0, device=device)
 
 
@@ -336,7 +336,7 @@ def test_free_points_without_eps_are_refused(device):
 
 
 def test_free_points_with_min_samples_of_a_plane_are_refused(device):
-    with refused(UsageError, 1, "planes"):
+    with refused(UsageError, "min_samples", "planes"):
         cluster_points(PointCloud(scattered_points(100)), eps=1.0, min_samples="plane+1", device=device)
 
 

@@ -182,7 +182,7 @@ def test_slices_without_points_are_no_ghosts(device, empty):
     assert found.slices == ()
 
 
-def test_ghost_slices_found_in_slabs_are_the_same(device):
+def test_ghost_slices_found_in_slabs_are_those_of_the_whole_volume(device):
     volume = rods_with_foreign_slices(6)
     whole = find_ghost_slices(volume, BONE, device=device)
 
@@ -275,6 +275,7 @@ class GhostSeries:
 
 @pytest.fixture(scope="module")
 def ghost_series(shared_folder) -> GhostSeries:
+    """The series that `GHOST_SETTINGS` make."""
     folder = make_once(shared_folder, "ghosts", write_ghost_series)
     with np.load(folder / "truth.npz") as truth:
         return GhostSeries(folder / "series", truth["slices"].tolist(), truth["bone"])

@@ -57,7 +57,7 @@ def test_most_neighbours_allowed_equal_the_twin(device):
 
 
 @pytest.mark.parametrize("edge", [0.5, 2.0, 9.0, 50.0])
-def test_neighbours_are_the_same_in_cells_of_any_size(device, edge, monkeypatch):
+def test_neighbours_in_cells_of_any_size_equal_the_twin(device, edge, monkeypatch):
     monkeypatch.setattr(neighbours, "choose_cell_edge", lambda points, k: edge)
     assert_neighbours_equal_twin(device, scattered_points(3000), k=16)
 

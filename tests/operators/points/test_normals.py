@@ -144,7 +144,7 @@ def test_gradients_of_the_twin_of_a_linear_field_in_uneven_slices_are_its_slope(
     assert np.abs(found - SLOPE).max() < GRADIENT_SHARE * np.abs(SLOPE).max()
 
 
-def test_slabs_have_the_same_gradients(device):
+def test_gradients_found_in_slabs_are_those_of_the_whole_volume(device):
     volume, middle = ball()
     points = middle + np.random.default_rng(4).uniform(-25.0, 25.0, (1000, 3))
     whole = normals.find_gradients(DeviceVolume(volume, device=device), points, stopwatch=Stopwatch())

@@ -61,7 +61,7 @@ def test_far_point_of_a_small_cloud_is_an_outlier(device):
 
 @pytest.mark.parametrize("deviations", [-1.0, float("nan"), float("inf"), "2", True])
 def test_wrong_deviations_are_refused(device, deviations):
-    with refused(UsageError, 0):
+    with refused(UsageError, "deviations", 0):
         remove_outliers(PointCloud(np.eye(3)), k=2, deviations=deviations, device=device)
 
 

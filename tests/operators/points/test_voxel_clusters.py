@@ -147,7 +147,7 @@ def test_clusters_on_devices_with_small_work_groups_equal_the_twin(device, group
 
 
 @pytest.mark.parametrize("parts_per_core", [1, 7, 1000])
-def test_clusters_are_the_same_in_parts_of_any_size(device, parts_per_core):
+def test_labels_of_clusters_found_in_parts_of_any_size_are_those_of_the_default(device, parts_per_core):
     volume = Volume(random_voxels((6, 9, 70), density=0.3), FINE)
     labels = search(device, volume, eps=1.2, samples=5, parts_per_core=parts_per_core).label()
     np.testing.assert_array_equal(labels, search(device, volume, eps=1.2, samples=5).label())
@@ -384,7 +384,7 @@ def nine_far_voxels() -> Volume:
 
 
 def test_an_eps_whose_search_would_take_too_long_is_refused(device):
-    with refused(UsageError, "volume"):
+    with refused(UsageError, "eps", 1e11):  # the most visits of rows
         cluster_points(nine_far_voxels(), eps=300.0, min_samples=6, hu=ONES, device=device)
 
 
@@ -411,7 +411,7 @@ def sparse_values() -> Volume:
     return Volume(np.random.default_rng(2).integers(0, 100, (40, 30, 64)).astype(np.float32), FINE)
 
 
-def test_volumes_that_do_not_fit_into_memory_have_the_same_clusters(device):
+def test_clusters_of_a_volume_beyond_the_memory_are_those_of_the_whole(device):
     volume = sparse_values()
     slice_bytes = volume.voxels[0].nbytes
     how = {"eps": 1.2, "min_samples": 3, "hu": (97, 100), "device": device}
@@ -460,7 +460,7 @@ def test_too_little_memory_is_refused_before_any_is_taken(device, monkeypatch):
         ({"hu": (7, 9)}, "no voxel lies from 7 to 9 HU: there is nothing to cluster"),
     ],
 )
-def test_bad_input_is_refused(device, arguments, words):
+def test_parameters_that_cannot_cluster_a_volume_are_refused(device, arguments, words):
     with pytest.raises(UsageError, match=words):
         cluster_points(Volume(random_voxels((3, 4, 40), density=0.4), FINE), device=device, **arguments)
 
@@ -483,7 +483,7 @@ def test_empty_cloud_is_refused(device, small_cloud):
 
 
 def test_cloud_with_a_voxel_twice_is_refused(device, small_cloud):
-    with refused(UsageError, 1, 3):
+    with refused(UsageError, 1, 3):  # one of three points
         cluster_points(small_cloud.select([0, 1, 1]), device=device)
 
 
@@ -498,7 +498,7 @@ def test_cloud_beside_a_band_of_values_is_refused(device, small_cloud):
 
 
 def test_cloud_beside_a_volume_too_small_for_its_voxels_is_refused(device, small_cloud):
-    with refused(UsageError, "volume", 3):
+    with refused(UsageError, "volume", 39, 2):  # columns: the highest of a voxel, and those that the volume has
         cluster_points(small_cloud, volume=Volume(random_voxels((2, 2, 2), density=1.0), FINE), device=device)
 
 
@@ -515,8 +515,8 @@ def test_cloud_of_one_voxel_is_one_cluster_with_min_samples_one(device, small_cl
 def test_an_eps_of_a_thousand_pixels_is_refused(device):
     """Each of 6.6 million voxels has some 3 million others within eps: hours of work."""
     volume = Volume(np.ones((200, 1000, 33), np.int8), np.diag((1.0, 0.01, 0.01, 1.0)))
-    with refused(UsageError, "volume"):
-        cluster_points(volume, 10.0, hu=ONES, device=device)
+    with refused(UsageError, "eps", 1e11):  # the most visits of rows
+        cluster_points(volume, eps=10.0, hu=ONES, device=device)
 
 
 @pytest.mark.release

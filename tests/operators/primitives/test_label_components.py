@@ -125,7 +125,7 @@ def test_components_are_numbered_by_their_smallest_vertex_and_unused_vertices_ha
     assert labels.tolist() == [-1, 0, -1, 1, 2, 2, -1, 2, 0, 2, -1]
 
 
-def test_the_order_of_triangles_does_not_matter(device):
+def test_labels_of_components_do_not_depend_on_the_order_of_triangles_and_corners(device):
     triangles = random_triangles(vertices=400, triangles=160)
     shuffled = np.random.default_rng(1).permuted(np.random.default_rng(2).permutation(triangles), axis=1)
     _, expected = label_components(device, triangles, 400)

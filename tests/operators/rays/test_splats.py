@@ -179,7 +179,7 @@ def test_points_without_room_beside_their_picture_are_refused(device: Any, many_
         draw_splats(device, discs, shot, memory=PICTURE_BYTES + 1000)
 
 
-def test_a_cloud_far_from_the_origin_looks_the_same(device: Any) -> None:
+def test_a_cloud_far_from_the_origin_looks_as_the_same_points_near_it(device: Any) -> None:
     points, normals = ball(3000)
     near = clrecon.render(PointCloud(points, normals), size=SIZE, view=(20, 30), radius_mm=0.5, device=device)
     away = PointCloud(points.astype(np.float64) + 1e5, normals)

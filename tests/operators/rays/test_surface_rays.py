@@ -91,7 +91,7 @@ def test_surface_of_every_scene_equals_its_twin(device, name):
 @pytest.mark.release
 @pytest.mark.usefixtures("users_kernels")
 @pytest.mark.parametrize("name", daily(1, ["soft", "clipped", "uneven"]))
-def test_surface_found_by_one_sample_at_a_time_is_the_same(device, name, monkeypatch):
+def test_surface_found_by_one_sample_at_a_time_looks_as_by_eight(device, name, monkeypatch):
     volume, settings = scene(name)
     found = cast_rays(device, volume, **settings, iso_value=LEVEL_HU)
     monkeypatch.setitem(device.kernel_variants, "LANES", "1")
@@ -100,7 +100,7 @@ def test_surface_found_by_one_sample_at_a_time_is_the_same(device, name, monkeyp
 
 @pytest.mark.parametrize("towards", [(0.1, 0.3, 1.0), (-0.1, 0.2, -1.0), (0.5, 1.0, 0.05)])
 @pytest.mark.parametrize("grid", ["oblique", "uneven"])
-def test_slabs_give_the_picture_of_the_whole(device, grid, towards):
+def test_surface_in_slabs_has_the_picture_of_the_whole(device, grid, towards):
     volume = make_volume(blobs, grid, extent=22.0, dtype=np.int16)
     camera, size = look(volume, towards, half_height=13.0, perspective=True), (24, 16)
     how = {"iso_value": LEVEL_HU, "size": size, "lighting": MATT}

@@ -367,7 +367,7 @@ def test_bytes_a_pixel_are_those_of_the_buffers(device: Any, monkeypatch: pytest
     assert bytes_of(61, 47) - bytes_of(11, 47) == PIXEL_BYTES * 50 * 47
 
 
-def test_a_mesh_far_away_looks_the_same(device: Any) -> None:
+def test_a_mesh_far_from_the_origin_looks_as_the_same_mesh_near_it(device: Any) -> None:
     mesh = Mesh(*ball(radius=8.0))
     near = clrecon.render(mesh, size=SIZE, view=(20, 30), device=device)
     away = Mesh(mesh.vertices.astype(np.float64) + 1e5, mesh.triangles)

@@ -32,11 +32,18 @@ def take_sheet(volume: Volume, device: Any, view: str = "axial", **style: Any) -
 
 
 def tiles_of(picture: clrecon.Rendering) -> list[np.ndarray]:
+    """HU of the pixels of each tile, in the order of the report."""
     width, height = picture.report["tile_size"]
     return [
         picture.values[tile["top"] : tile["top"] + height, tile["left"] : tile["left"] + width]
         for tile in picture.report["tiles"]
     ]
+
+
+def heights_of(picture: clrecon.Rendering) -> list[float]:
+    """z of the middle of each tile, mm."""
+    middles = [tile["middle_lps_mm"] for tile in picture.report["tiles"]]
+    return [z for _, _, z in middles]
 
 
 @pytest.fixture(params=[("axial", 0, 18), ("coronal", 1, 0), ("sagittal", 2, 0)], ids=["axial", "coronal", "sagittal"])
@@ -85,8 +92,7 @@ def test_a_number_of_slices_is_spread_over_the_scan_on_planes_of_voxels(device: 
 def test_slices_at_a_distance_lie_at_its_multiples_and_have_no_number(device: Any) -> None:
     """Slices at 100, 103 ... 157 mm have 0, 10 ... 190 HU."""
     picture = take_sheet(volume_of_steps(), device, sheet="10mm")
-    heights = [tile["middle_lps_mm"][2] for tile in picture.report["tiles"]]
-    assert heights == [150.0, 140.0, 130.0, 120.0, 110.0, 100.0]
+    assert heights_of(picture) == [150.0, 140.0, 130.0, 120.0, 110.0, 100.0]
     assert {tile["slice"] for tile in picture.report["tiles"]} == {None}
     _, at_140_mm, *_ = tiles_of(picture)
     assert at_140_mm[20, 20] == pytest.approx(10 * (140.0 - 100.0) / 3.0, abs=1e-3)  # HU in float32; measured 5e-6
@@ -97,8 +103,7 @@ def test_uneven_slices_have_their_places_and_values(device: Any) -> None:
     kept = [0, 1, 4, 5, 11, 19]
     uneven = Volume(volume.voxels[kept], AFFINE, slice_positions=volume.slice_origins()[kept])
     picture = take_sheet(uneven, device, slices=1)
-    heights = [tile["middle_lps_mm"][2] for tile in picture.report["tiles"]]
-    assert heights == [100.0 + 3.0 * slice_ for slice_ in kept[::-1]]  # from the head down
+    assert heights_of(picture) == [100.0 + 3.0 * slice_ for slice_ in kept[::-1]]  # from the head down
     assert [float(np.nanmax(values)) for values in tiles_of(picture)] == [10 * slice_ for slice_ in kept[::-1]]
 
 
@@ -250,4 +255,4 @@ def test_number_or_distance_of_a_sheet_is_read_from_text_and_is_20_by_default(gi
 
 
 def test_every_fourth_slice_makes_a_sheet_of_20() -> None:
-    assert PlaneCut(slices=4).sheet == 20
+    assert PlaneCut(slices=4).sheet == PlaneCut(sheet=True).sheet == 20
