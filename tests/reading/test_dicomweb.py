@@ -258,7 +258,7 @@ def test_list_that_is_no_dicom_json_is_refused(content: bytes, archive: Archive)
 
 
 def test_more_bytes_than_allowed_are_refused_before_they_arrive(archive: Archive) -> None:
-    announces_2000 = answering(b"", STORED, Content_Length="2000")  # none of them arrives
+    announces_2000 = answering(b"", kind=STORED, Content_Length="2000")  # none of them arrives
     archive.answers = [archive.answer, archive.answer, announces_2000]
 
     with refused(RefusedInputError, archive.host, "TMPDIR"):
