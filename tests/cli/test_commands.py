@@ -388,12 +388,13 @@ def test_info_of_a_phantom_has_the_affine_and_tilt_of_its_truth(tmp_path: Path, 
     assert series["tilt_deg"] == pytest.approx(-12.0, abs=1e-4)  # directions have 9 decimals
 
 
-def test_phantom_over_an_earlier_one_is_written_with_its_shape_in_words(tmp_path: Path, printed: Printer) -> None:
+def test_phantom_over_an_earlier_one_takes_its_place_with_its_shape_in_words(tmp_path: Path, printed: Printer) -> None:
     assert main(["phantom", str(tmp_path / "ph"), *PHANTOM, "-q"]) == 0
 
     assert main(["phantom", str(tmp_path / "ph"), *PHANTOM, "--seed", "4"]) == 0
 
     printed().assert_output(24, 40, 32)
+    assert json.loads((tmp_path / "ph" / "truth.json").read_text())["seed"] == 4
 
 
 def test_phantom_in_a_folder_with_other_files_is_refused_and_they_stay(tmp_path: Path, printed: Printer) -> None:

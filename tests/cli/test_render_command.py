@@ -367,7 +367,8 @@ def test_label_has_the_given_colour(render: Renders, label_20: Path, mode: list[
     image, report = render(*mode, "--light", "none", "--labels", label_20, "--label-color", "20=blue")
     (label,) = report["labels"]
     assert (label["label_number"], label["color"], label["opacity"]) == (20, "blue", None)
-    assert image[is_lit(image)][:, 2].mean() > 2.0 * image[is_lit(image)][:, 0].mean()
+    red, _, blue, _ = image[is_lit(image)].mean(axis=0)
+    assert blue > 3.0 * red  # measured 5.1 times in the volume, whose rim is grey
 
 
 @pytest.mark.seconds

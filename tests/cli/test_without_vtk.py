@@ -75,8 +75,8 @@ def test_nearest_points_and_rays_of_a_mesh_are_found_without_vtk(device: Any) ->
     assert main(["mesh", "ct", "-o", "b.ply", "--device", str(device.index), "-q"]) == 0
     mesh = read_mesh("b.ply")
 
-    _, distances = mesh.closest_points(mesh.vertices[:3])[:2]
+    _, distances, _ = mesh.closest_points(mesh.vertices[:3])
     assert distances == pytest.approx(0.0, abs=1e-6)  # of vertices in float32
     middles = mesh.vertices[mesh.triangles[:3]].mean(axis=1)
-    above = middles + [0.0, 0.0, 500.0]
+    above = middles + [0.0, 0.0, 500.0]  # mm: outside of the mesh
     assert np.isfinite(mesh.ray(above, middles - above)).all()

@@ -40,6 +40,8 @@ AFFINES = {
     "sagittal": compose_affine(i_step=(0, 0.7, 0), j_step=(0, 0, -0.5), k_step=(-1.25, 0, 0), origin=ORIGIN),
 }
 SHEARED = affine_of_steps(STEPS @ np.array([[1, 0, 0], [0, 1, 0.3], [0, 0, 1]]))
+SHEAR_DEG = 6.84
+"""Each slice is moved by 0.3 of a row of 0.5 mm for 1.25 mm of height."""
 DTYPES = ("int8", "uint8", "int16", "uint16", "int32", "float32")
 IJK = np.array([(i, j, k) for k in range(5) for j in range(4) for i in range(3)])
 WAYS = {
@@ -238,7 +240,7 @@ to_libraries_of_right_angles = pytest.mark.parametrize("library", ["pyvista", "S
 @to_libraries_of_right_angles
 def test_a_sheared_volume_is_refused_with_its_angle_where_resampling_was_not_asked_for(library):
     convert, _ = WAYS[library]
-    with refused(UsageError, 6.84, convert.__name__, "resample=True"):
+    with refused(UsageError, SHEAR_DEG, convert.__name__, "resample=True"):
         convert(numbered_volume(SHEARED))
 
 
