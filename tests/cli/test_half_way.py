@@ -25,14 +25,14 @@ def ct(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return ct_files.write_series(tmp_path_factory.mktemp("ct"), hu.round().astype("int16"))
 
 
-def run(ct: Path, device: Any, tmp_path: Path, *arguments: str) -> int:
+def run_mesh(ct: Path, device: Any, tmp_path: Path, *arguments: str) -> int:
     return main(["mesh", str(ct), "-o", str(tmp_path / "b.stl"), "--device", str(device.index), *arguments])
 
 
 def test_words_of_auto_have_the_iso_value_and_the_materials_it_lies_half_way_between(
     ct: Path, device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(ct, device, tmp_path, "--hu", "auto") == 0
+    assert run_mesh(ct, device, tmp_path, "--hu", "auto") == 0
     shown = capsys.readouterr().out
     (line,) = [line for line in shown.splitlines() if line.startswith("surface")]
     level = float(line.split()[1])
@@ -44,7 +44,7 @@ def test_words_of_auto_have_the_iso_value_and_the_materials_it_lies_half_way_bet
 def test_half_of_two_given_materials_is_reported_with_a_warning_where_the_scan_has_not_one(
     ct: Path, device: Any, tmp_path: Path, printed: Printer
 ) -> None:
-    assert run(ct, device, tmp_path, "--hu", "half:700,-100", "--json") == 0
+    assert run_mesh(ct, device, tmp_path, "--hu", "half:700,-100", "--json") == 0
 
     report = printed().report()
     assert report["iso_value_hu"] == (700 - 100) / 2
@@ -55,7 +55,7 @@ def test_half_of_two_given_materials_is_reported_with_a_warning_where_the_scan_h
 def test_words_of_half_have_the_iso_value_and_both_materials(
     ct: Path, device: Any, tmp_path: Path, printed: Printer
 ) -> None:
-    assert run(ct, device, tmp_path, "--hu", "half:700,0") == 0
+    assert run_mesh(ct, device, tmp_path, "--hu", "half:700,0") == 0
     printed().assert_output((700 + 0) / 2, 0, 700)
 
 
@@ -63,7 +63,7 @@ def test_auto_without_bone_ends_with_2_and_writes_nothing(device: Any, tmp_path:
     voxels = ct_files.sphere_voxels() * 0 + 8
     voxels[0, 0, 0] = 9
     water = ct_files.write_series(tmp_path / "water", voxels)
-    assert run(water, device, tmp_path, "--hu", "auto") == 2
+    assert run_mesh(water, device, tmp_path, "--hu", "auto") == 2
     message = printed()
     message.assert_error(8, "--hu")
     assert not (tmp_path / "b.stl").exists()

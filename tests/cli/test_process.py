@@ -18,7 +18,7 @@ COMMAND = [sys.executable, "-m", "clrecon.cli.main"]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
 
 
-def run(*arguments: str, stdout: Any = subprocess.PIPE, **variables: str) -> subprocess.CompletedProcess[str]:
+def run_clrecon(*arguments: str, stdout: Any = subprocess.PIPE, **variables: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [*COMMAND, *arguments],
         env=ENVIRONMENT | variables, stdout=stdout, stderr=subprocess.PIPE, text=True, timeout=120,
@@ -27,7 +27,7 @@ def run(*arguments: str, stdout: Any = subprocess.PIPE, **variables: str) -> sub
 
 def test_help_is_on_standard_output_within_three_seconds() -> None:
     start = time.perf_counter()
-    done = run("--help")
+    done = run_clrecon("--help")
     elapsed = time.perf_counter() - start
     assert (done.returncode, done.stderr) == (0, "")
     assert "mesh         make a mesh from a CT series" in done.stdout
@@ -35,14 +35,14 @@ def test_help_is_on_standard_output_within_three_seconds() -> None:
 
 
 def test_help_imports_neither_numpy_nor_a_driver() -> None:
-    done = run("mesh", "--help", PYTHONPROFILEIMPORTTIME="1")
+    done = run_clrecon("mesh", "--help", PYTHONPROFILEIMPORTTIME="1")
     imported = {line.rpartition("|")[2].strip().partition(".")[0] for line in done.stderr.splitlines()}
     assert "argparse" in imported
     assert imported & {"numpy", "pydicom", "pyopencl", "vtk", "vtkmodules", "pyvista", "skimage", "scipy"} == set()
 
 
 def test_error_of_a_process_is_one_line_on_standard_error_and_its_exit_code(tmp_path: Path) -> None:
-    done = run("info", str(tmp_path / "nothing here"))
+    done = run_clrecon("info", str(tmp_path / "nothing here"))
     assert (done.returncode, done.stdout) == (2, "")
     assert len(done.stderr.splitlines()) == 1
     assert done.stderr.startswith("clrecon: error: ")
@@ -53,7 +53,7 @@ def test_reader_that_leaves_early_is_no_error(tmp_path: Path) -> None:
     write_series(tmp_path / "ct")
     reading, writing = os.pipe()
     os.close(reading)
-    done = run("info", str(tmp_path / "ct"), stdout=writing)
+    done = run_clrecon("info", str(tmp_path / "ct"), stdout=writing)
     os.close(writing)
     assert (done.returncode, done.stderr) == (0, "")
 
@@ -62,13 +62,13 @@ def test_reader_that_leaves_early_is_no_error(tmp_path: Path) -> None:
 def test_process_with_a_full_disk_behind_standard_output_ends_with_6(tmp_path: Path) -> None:
     write_series(tmp_path / "ct")
     with open("/dev/full", "w") as full:
-        done = run("info", str(tmp_path / "ct"), "--json", stdout=full)
+        done = run_clrecon("info", str(tmp_path / "ct"), "--json", stdout=full)
     assert done.returncode == 6
     assert done.stderr == "clrecon: error: cannot write to standard output: No space left on device\n"
 
 
 def test_letters_that_a_plain_locale_has_not_are_printed_as_codes(tmp_path: Path) -> None:
-    done = run("info", str(tmp_path / "größe"), PYTHONIOENCODING="ascii", PYTHONUTF8="0")
+    done = run_clrecon("info", str(tmp_path / "größe"), PYTHONIOENCODING="ascii", PYTHONUTF8="0")
     assert done.returncode == 2
     assert "gr\\xf6\\xdfe" in done.stderr
 

@@ -28,14 +28,14 @@ def ct(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return ct_files.write_series(tmp_path_factory.mktemp("ct"), voxels)
 
 
-def run(ct: Path, device: Any, tmp_path: Path, *arguments: str) -> int:
+def run_mesh(ct: Path, device: Any, tmp_path: Path, *arguments: str) -> int:
     return main(["mesh", str(ct), "-o", str(tmp_path / "b.stl"), "--device", str(device.index), *arguments])
 
 
 def test_mesh_below_a_level_is_the_lung_without_the_air_about_the_body(
     ct: Path, device: Any, tmp_path: Path, printed: Printer
 ) -> None:
-    assert run(ct, device, tmp_path, "--below", "-400", "--strict", "--json") == 0
+    assert run_mesh(ct, device, tmp_path, "--below", "-400", "--strict", "--json") == 0
     report = printed().report()
     assert (report["components"], report["inside_hu"]) == (1, [None, -400.0])
     assert report["iso_level_hu"] == -400.0 - 0.5  # between integers
@@ -49,7 +49,7 @@ def test_mesh_below_a_level_is_the_lung_without_the_air_about_the_body(
 def test_mesh_below_a_level_with_the_air_about_the_body_is_warned_of_as_one_that_can_show_a_face(
     ct: Path, device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(ct, device, tmp_path, "--below", "-400", "--keep-outside") == 0
+    assert run_mesh(ct, device, tmp_path, "--below", "-400", "--keep-outside") == 0
     shown = capsys.readouterr()
     assert "surface  below -400 HU (as given), closed" in shown.out
     assert "can show a face" in shown.err
@@ -58,7 +58,7 @@ def test_mesh_below_a_level_with_the_air_about_the_body_is_warned_of_as_one_that
 def test_range_and_iso_value_of_one_command_are_a_file_each(
     ct: Path, device: Any, tmp_path: Path, printed: Printer
 ) -> None:
-    assert run(ct, device, tmp_path, "--hu", "-900:-700,0", "-v") == 0
+    assert run_mesh(ct, device, tmp_path, "--hu", "-900:-700,0", "-v") == 0
     printed().assert_output(-900, -700, 0)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["b_-900to-700hu.stl", "b_0hu.stl"]
 
@@ -106,5 +106,5 @@ def test_range_or_level_below_with_a_setting_that_excludes_it_is_refused(setting
 def test_levels_that_exclude_each_other_are_refused_with_exit_code_3(
     options: list[str], facts: tuple[str | int, ...], ct: Path, device: Any, tmp_path: Path, printed: Printer
 ) -> None:
-    assert run(ct, device, tmp_path, *options) == 3
+    assert run_mesh(ct, device, tmp_path, *options) == 3
     printed().assert_error(*facts)

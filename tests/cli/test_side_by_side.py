@@ -26,7 +26,7 @@ def ct(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def start(ct: Path, target: Path, device: Any, **variables: str) -> subprocess.Popen[str]:
+def start_mesh(ct: Path, target: Path, device: Any, **variables: str) -> subprocess.Popen[str]:
     """Make a mesh and a report in a process."""
     command = [sys.executable, "-m", "clrecon", "mesh", str(ct), "-o", str(target), "--device", str(device.index)]
     command += ["--report", str(target.with_suffix(".json")), "-q"]
@@ -73,9 +73,9 @@ def test_mesh_and_report_are_the_same_with_other_threads_locale_time_zone_and_um
     device, ct: Path, tmp_path: Path, extension: str
 ) -> None:
     plain, odd = make_targets(tmp_path, extension)
-    finish(start(ct, plain, device))
+    finish(start_mesh(ct, plain, device))
     finish(
-        start(
+        start_mesh(
             ct,
             odd,
             device,
@@ -101,7 +101,7 @@ def test_two_processes_on_one_device_at_once_write_the_same_mesh_and_report(devi
     cache.mkdir(mode=0o700)
     variables = {"XDG_CACHE_HOME": str(cache), "POCL_CACHE_DIR": str(cache / "pocl")}
     targets = make_targets(tmp_path, ".stl")
-    processes = [start(ct, target, device, **variables) for target in targets]
+    processes = [start_mesh(ct, target, device, **variables) for target in targets]
     for process in processes:
         finish(process)
     assert read_output(targets[0]) == read_output(targets[1])

@@ -26,7 +26,7 @@ def ct(tmp_path_factory):
     return folder
 
 
-def run(*arguments: object) -> int:
+def run_clrecon(*arguments: object) -> int:
     return main([str(argument) for argument in arguments])
 
 
@@ -35,10 +35,10 @@ def test_mesh_on_standard_output_has_the_bytes_of_a_file_in_its_format(
     device, ct, tmp_path, capfdbinary, output, extension
 ):
     command = ("mesh", ct, "--hu", 200, "--device", device.index)
-    assert run(*command, "-o", tmp_path / f"a{extension}") == 0
+    assert run_clrecon(*command, "-o", tmp_path / f"a{extension}") == 0
     capfdbinary.readouterr()
 
-    assert run(*command, "-o", output) == 0
+    assert run_clrecon(*command, "-o", output) == 0
 
     streamed, _ = capfdbinary.readouterr()
     assert streamed == (tmp_path / f"a{extension}").read_bytes()
@@ -46,7 +46,7 @@ def test_mesh_on_standard_output_has_the_bytes_of_a_file_in_its_format(
 
 @pytest.mark.release
 def test_mesh_on_standard_output_in_3mf_is_a_package_of_it(device, ct, capfdbinary):
-    assert run("mesh", ct, "--hu", 200, "--device", device.index, "-o", "-.3mf") == 0
+    assert run_clrecon("mesh", ct, "--hu", 200, "--device", device.index, "-o", "-.3mf") == 0
 
     streamed, _ = capfdbinary.readouterr()
     with zipfile.ZipFile(io.BytesIO(streamed)) as package:  # whose bytes hold the time
@@ -57,7 +57,7 @@ def test_mesh_on_standard_output_in_3mf_is_a_package_of_it(device, ct, capfdbina
 def test_words_of_a_mesh_on_standard_output_go_to_standard_error_with_its_unit(
     device, ct, capfdbinary, output, is_in_metres
 ):
-    assert run("mesh", ct, "--hu", 200, "--device", device.index, "-o", output) == 0
+    assert run_clrecon("mesh", ct, "--hu", 200, "--device", device.index, "-o", output) == 0
 
     _, words = capfdbinary.readouterr()
     assert b"input    " in words
@@ -69,10 +69,10 @@ def test_words_of_a_mesh_on_standard_output_go_to_standard_error_with_its_unit(
 @pytest.mark.release
 def test_report_on_standard_output_is_that_in_a_file_and_words_go_to_standard_error(device, ct, tmp_path, printed):
     common = ("mesh", ct, "--hu", 200, "-o", tmp_path / "a.stl", "--device", device.index)
-    assert run(*common, "--report", tmp_path / "r.json") == 0
+    assert run_clrecon(*common, "--report", tmp_path / "r.json") == 0
     written = json.loads((tmp_path / "r.json").read_text())
     printed()
-    assert run(*common, "--report", "-") == 0
+    assert run_clrecon(*common, "--report", "-") == 0
     said = printed()
     streamed = said.report()
     assert streamed.keys() == written.keys()
@@ -93,7 +93,7 @@ def test_result_of_another_command_goes_to_standard_output(device, ct, capfdbina
     command, *options = arguments
     at = [] if command == "export" else ["--device", device.index]
 
-    assert run(command, ct, *options, *at) == 0
+    assert run_clrecon(command, ct, *options, *at) == 0
 
     streamed, words = capfdbinary.readouterr()
     assert streamed.startswith(start)
@@ -102,7 +102,7 @@ def test_result_of_another_command_goes_to_standard_output(device, ct, capfdbina
 
 
 def test_cloud_on_standard_output_in_xyz_is_three_coordinates_a_line(device, ct, capfdbinary):
-    assert run("cloud", ct, "--hu", 200, "-o", "-.xyz", "--device", device.index) == 0
+    assert run_clrecon("cloud", ct, "--hu", 200, "-o", "-.xyz", "--device", device.index) == 0
 
     streamed, _ = capfdbinary.readouterr()
     assert np.loadtxt(io.BytesIO(streamed))[:, :3].shape[0] > 1000  # points of a cloud of 2,686
@@ -132,7 +132,7 @@ def test_cloud_on_standard_output_in_xyz_is_three_coordinates_a_line(device, ct,
 )
 def test_output_that_one_stream_cannot_hold_is_refused_in_one_line(ct, capfdbinary, arguments, code, words):
     command, *rest = arguments
-    assert run(command, ct, *rest) == code
+    assert run_clrecon(command, ct, *rest) == code
     out, err = capfdbinary.readouterr()
     if "--json" not in rest:
         assert out == b""
@@ -170,9 +170,9 @@ def test_report_of_each_command_goes_to_standard_output(
 ):
     monkeypatch.setenv("CLRECON_DEVICE", str(device.index))
     if arguments[0] == "distance":
-        assert run("mesh", spine, "-o", tmp_path / "out_a.stl", "-q") == 0
+        assert run_clrecon("mesh", spine, "-o", tmp_path / "out_a.stl", "-q") == 0
     given = [word.format(ct=spine, out=tmp_path / "out") for word in arguments]
-    code = run(*given, "--report", "-")
+    code = run_clrecon(*given, "--report", "-")
     said = printed()
     assert code in (0, 8), said  # 8: a vertebra of coarse voxels may be unsure
     assert said.report()[entry] is not None
@@ -181,28 +181,28 @@ def test_report_of_each_command_goes_to_standard_output(
 
 
 def test_table_of_labels_goes_to_standard_output_with_a_line_for_each(spine, capfdbinary):
-    assert run("stats", spine, "--labels", spine / "levels.nrrd", "--csv", "-") == 0
+    assert run_clrecon("stats", spine, "--labels", spine / "levels.nrrd", "--csv", "-") == 0
     out, err = capfdbinary.readouterr()
     assert out.startswith(b"number,name,") and out.count(b"\n") == 4  # the head, and a line for each label
     assert b"wrote    standard output" in err
 
 
 def test_label_map_goes_to_standard_output_without_a_picture(spine, capfdbinary):
-    assert run("vertebrae", spine, "-o", "-") in (0, 8)  # 8: a vertebra of coarse voxels may be unsure
+    assert run_clrecon("vertebrae", spine, "-o", "-") in (0, 8)  # 8: a vertebra of coarse voxels may be unsure
     out, err = capfdbinary.readouterr()
     assert out[:2] == b"\x1f\x8b"  # a NIfTI in gzip
     assert b"wrote    standard output" in err and b"picture" not in err
 
 
 def test_report_of_a_failed_job_is_not_on_standard_output(ct, tmp_path, printed):
-    assert run("mesh", ct, "-o", tmp_path / "a.stl", "--hu", 5000, "--report", "-") == 2
+    assert run_clrecon("mesh", ct, "-o", tmp_path / "a.stl", "--hu", 5000, "--report", "-") == 2
     assert printed().output_lines == 0
 
 
 def test_mesh_for_a_terminal_is_refused(ct, capsys, monkeypatch):
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
 
-    assert run("mesh", ct, "-o", "-") == 3
+    assert run_clrecon("mesh", ct, "-o", "-") == 3
 
     printed = capsys.readouterr()
     assert "standard output is a terminal" in printed.err
@@ -214,7 +214,7 @@ MOST_BYTES_IN_A_PIPE = 65_536  # of Linux; fewer elsewhere
 
 def test_reader_that_closes_standard_output_before_all_is_written_is_no_error(device, ct, tmp_path):
     mesh = ["mesh", str(ct), "--hu", "200", "--device", str(device.index)]
-    assert run(*mesh, "-o", tmp_path / "whole.stl") == 0
+    assert run_clrecon(*mesh, "-o", tmp_path / "whole.stl") == 0
     assert (tmp_path / "whole.stl").stat().st_size > MOST_BYTES_IN_A_PIPE  # 268,484: the command has to wait
 
     command = [sys.executable, "-m", "clrecon", *mesh, "-o", "-"]

@@ -44,7 +44,7 @@ class Nothing:
 
 
 @cache
-def things() -> dict[str, Any]:
+def examples() -> dict[str, Any]:
     """One of each kind, a ball of bone in 10 slices."""
     k, j, i = np.indices((10, 11, 12))
     ball = np.where((k - 5) ** 2 + (j - 5) ** 2 + (i - 6) ** 2 < 12, 700, -1000).astype(np.int16)
@@ -84,11 +84,11 @@ def wrong_values() -> list[Any]:
         (200, None),
     ]
     arrays = [np.zeros(3), np.zeros((2, 2), object)]
-    return [*odd, *arrays, *(things()[name] for name in ("Volume", "Mesh", "LabelMap", "PointCloud", "Camera"))]
+    return [*odd, *arrays, *(examples()[name] for name in ("Volume", "Mesh", "LabelMap", "PointCloud", "Camera"))]
 
 
 def public_callables() -> list[str]:
-    """Names of functions and classes, and ``Class.method`` of what `things` has."""
+    """Names of functions and classes, and ``Class.method`` of what `examples` has."""
     found = [name for name in dir(clrecon) if not name.startswith("_") and name not in RESULTS]
     found = [name for name in found if callable(getattr(clrecon, name)) and is_own(getattr(clrecon, name))]
     classes = [name for name in found if inspect.isclass(getattr(clrecon, name))]
@@ -117,23 +117,23 @@ def parameters(function: Callable[..., Any]) -> list[inspect.Parameter]:
 
 def sound_arguments(function: Callable[..., Any], folder: Path) -> dict[str, Any]:
     """What the function needs, as far as it follows from names and annotations."""
-    volume, mesh = things()["Volume"], things()["Mesh"]
+    volume, mesh = examples()["Volume"], examples()["Mesh"]
     known = {
         "hu": (200, 3000), "iso_value": 200, "iso_values": [200], "label": 1,
-        "voxels": things()["LabelMap"].voxels,
-        "affine": volume.affine, "points": things()["PointCloud"].points, "vertices": mesh.vertices,
+        "voxels": examples()["LabelMap"].voxels,
+        "affine": volume.affine, "points": examples()["PointCloud"].points, "vertices": mesh.vertices,
         "triangles": mesh.triangles, "path": folder / "new.nii.gz", "name": "median", "method": "t-mc", "mm": 1.0,
-        "rules": "largest:1", "fraction": 0.5, "frames": [things()["Rendering"]] * 2, "room": things()["Mask"],
+        "rules": "largest:1", "fraction": 0.5, "frames": [examples()["Rendering"]] * 2, "room": examples()["Mask"],
     }  # fmt: skip
     found = {}
     for each in parameters(function):
         if each.default is each.empty:
-            of_kind = [thing for name, thing in things().items() if name in str(each.annotation)]
+            of_kind = [thing for name, thing in examples().items() if name in str(each.annotation)]
             found[each.name] = known.get(each.name, of_kind[0] if of_kind else 3)
     return found
 
 
-def faults(function: Callable[..., Any], folder: Path) -> Iterator[str]:
+def find_faults(function: Callable[..., Any], folder: Path) -> Iterator[str]:
     sound = sound_arguments(function, folder)
     small = {"samples": 50, "size": (16, 16)}  # what runs all the same is to be quick
     sound |= {name: value for name, value in small.items() if name in inspect.signature(function).parameters}
@@ -159,8 +159,8 @@ def test_wrong_argument_of_a_public_function_is_refused_with_the_name_of_the_par
 ) -> None:
     monkeypatch.chdir(tmp_path)
     kind, _, method = name.partition(".")
-    function = getattr(things()[kind] if method else clrecon, method or kind)
-    assert list(faults(function, tmp_path)) == []
+    function = getattr(examples()[kind] if method else clrecon, method or kind)
+    assert list(find_faults(function, tmp_path)) == []
 
 
 @explains_arguments
@@ -187,14 +187,14 @@ def sample(
 def test_message_about_a_wrong_argument_says_what_is_expected_and_what_was_given(
     arguments: dict[str, Any], words: str
 ) -> None:
-    with pytest.raises(UsageError) as refused:
-        sample(**{"volume": things()["Volume"], **arguments})
-    assert str(refused.value) == words
-    assert refused.value.__cause__ is not None  # the error that the wrong argument has led to
+    with pytest.raises(UsageError) as caught:
+        sample(**{"volume": examples()["Volume"], **arguments})
+    assert str(caught.value) == words
+    assert caught.value.__cause__ is not None  # the error that the wrong argument has led to
 
 
 def test_arguments_of_numpy_types_and_a_list_in_place_of_a_tuple_are_accepted() -> None:
-    ten_slices = things()["Volume"]
+    ten_slices = examples()["Volume"]
     result = sample(ten_slices, np.uint8(3), np.float32(0.5), ["a", "b"])  # type: ignore[arg-type]
     assert result == (10 + 3, round(0.5), len("b"))
 
@@ -206,14 +206,14 @@ def test_missing_argument_raises_the_error_of_python() -> None:
 
 def test_error_of_right_arguments_is_raised_as_it_is() -> None:
     with refused(IndexError, "range"):
-        sample(things()["Volume"], 100)  # of a range of 100
+        sample(examples()["Volume"], count=100)  # of a range of 100
 
 
 def test_function_that_checks_no_argument_is_found(tmp_path: Path) -> None:
     def count_vertices(mesh: Any) -> int:
         return len(mesh.vertices)
 
-    assert any("AttributeError" in each for each in faults(count_vertices, tmp_path))
+    assert any("AttributeError" in each for each in find_faults(count_vertices, tmp_path))
 
 
 @pytest.mark.parametrize(
@@ -227,7 +227,7 @@ def test_function_that_checks_no_argument_is_found(tmp_path: Path) -> None:
 def test_message_about_a_wrong_argument_names_the_public_class_and_how_to_make_it(
     function: Callable[..., Any], words: str
 ) -> None:
-    first = (things()["Volume"],) if function is clrecon.fill_ghost_slices else ()
-    with pytest.raises(UsageError) as refused:
+    first = (examples()["Volume"],) if function is clrecon.fill_ghost_slices else ()
+    with pytest.raises(UsageError) as caught:
         function(*first, np.zeros((5, 3)))
-    assert str(refused.value).startswith(words)
+    assert str(caught.value).startswith(words)

@@ -36,7 +36,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def start(folder: Path, *options: str, **variables: str) -> subprocess.Popen[str]:
+def start_batch(folder: Path, *options: str, **variables: str) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "clrecon", "batch", "--no-picture", "m.csv", "-o", "out", "--hu", "300", *options]
     return subprocess.Popen(
         command, cwd=folder, env=os.environ | variables, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -48,7 +48,7 @@ def meshes(folder: Path) -> dict[str, bytes]:
 
 
 def test_killed_worker_of_a_cluster_loses_no_case_and_each_has_the_bytes_of_the_mesh_command(folder: Path) -> None:
-    process = start(folder, "--scheduler", "local", "--json")
+    process = start_batch(folder, "--scheduler", "local", "--json")
     wait_until(process, (folder / "out" / CASES[0]).exists)
     (worker,) = (child for child in children_of(process.pid) if children_of(child))  # its child makes the cases
     os.kill(worker, signal.SIGKILL)
@@ -86,7 +86,7 @@ def test_batch_whose_scheduler_goes_away_ends_with_9_and_resumes_without_one(
     wait_until(scheduler, (folder / "s.json").exists)
     dask("worker", "--nthreads", "1", "--no-nanny")
     address = json.loads((folder / "s.json").read_text())["address"]
-    process = start(folder, "--scheduler", address)
+    process = start_batch(folder, "--scheduler", address)
     wait_until(process, (folder / "out" / CASES[0]).exists)
     scheduler.kill()
     _, errors = process.communicate(timeout=240)
@@ -94,7 +94,7 @@ def test_batch_whose_scheduler_goes_away_ends_with_9_and_resumes_without_one(
     assert process.returncode == 9, errors
     *_, last = errors.splitlines()
     assert address in last and "--resume" in last
-    resumed = start(folder, "--resume", "--json")
+    resumed = start_batch(folder, "--resume", "--json")
     output, _ = resumed.communicate(timeout=240)
     assert json.loads(output)["statuses"] == {"done": len(CASES), "refused": 1}
     assert json.loads(output)["kept"] >= 1
@@ -104,7 +104,7 @@ def test_address_where_no_scheduler_answers_ends_with_9_before_any_case(folder: 
     with socket.socket() as nobody:
         nobody.bind(("127.0.0.1", 0))  # and does not listen
         address = f"tcp://127.0.0.1:{nobody.getsockname()[1]}"
-        process = start(folder, "--scheduler", address, DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT="200ms")
+        process = start_batch(folder, "--scheduler", address, DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT="200ms")
         _, errors = process.communicate(timeout=240)
 
     assert process.returncode == 9 and address in errors and len(errors.splitlines()) == 1
