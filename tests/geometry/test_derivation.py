@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -20,8 +21,15 @@ NEXT_ROW = re.compile(r"^ +(\[.*\])$")
 NUMBER = re.compile(r"-?\d+(?:\.(\d+))?")
 
 
-def read_numbers(text: str) -> dict[str, tuple[np.ndarray, float]]:
-    """Name to (values, half a unit of the last digit that is printed), of the indented lines of a page."""
+class Printed(NamedTuple):
+    """A number or an array of a page, and half a unit of its last digit."""
+
+    values: np.ndarray
+    half_a_digit: float
+
+
+def read_numbers(text: str) -> dict[str, Printed]:
+    """The numbers in the indented lines of a page, by name."""
     found: dict[str, list[str]] = {}
     name = ""
     for line in text.splitlines():
@@ -38,12 +46,12 @@ def read_numbers(text: str) -> dict[str, tuple[np.ndarray, float]]:
         values = [[float(match[0]) for match in NUMBER.finditer(row)] for row in rows]
         decimals = min(len(match[1] or "") for row in rows for match in NUMBER.finditer(row))
         array = np.array(values if len(values) > 1 else values[0])
-        numbers[name] = (array[0] if rows[0][0] not in "([" else array, 0.5 * 10.0**-decimals)
+        numbers[name] = Printed(array[0] if rows[0][0] not in "([" else array, 0.5 * 10.0**-decimals)
     return numbers
 
 
 @pytest.fixture(scope="module")
-def page() -> dict[str, tuple[np.ndarray, float]]:
+def page() -> dict[str, Printed]:
     """The numbers of the worked case on the page."""
     return read_numbers(PAGE.read_text(encoding="utf-8").split("## Worked case")[1])
 
@@ -59,9 +67,9 @@ def volume(page, tmp_path_factory) -> Volume:
 
     def put(ds, k):
         set_values(
-            ImageOrientationPatient=page["ImageOrientationPatient"][0].tolist(),
-            ImagePositionPatient=page[f"S_{k}"][0].tolist(),
-            PixelSpacing=page["PixelSpacing"][0].tolist(),
+            ImageOrientationPatient=page["ImageOrientationPatient"].values.tolist(),
+            ImagePositionPatient=page[f"S_{k}"].values.tolist(),
+            PixelSpacing=page["PixelSpacing"].values.tolist(),
         )(ds, k)
 
     write_series(folder, Plan(shape=(5, 4, 6)), put)
@@ -71,14 +79,14 @@ def volume(page, tmp_path_factory) -> Volume:
 def compute_page(page, volume: Volume) -> dict[str, np.ndarray]:
     """Everything on the page, as clrecon has it."""
     report, affine = volume.report, volume.affine
-    positions = np.array([page[f"S_{k}"][0] for k in range(5)])
+    positions = np.array([page[f"S_{k}"].values for k in range(5)])
     normal, step = slice_normal(affine), affine[:3, 2]
-    place = volume.ijk_to_lps([page["ijk"][0]])
-    np.testing.assert_allclose(volume.lps_to_ijk(place), [page["ijk"][0]], atol=1e-9)
-    gradient = normal_matrix(affine) @ page["g"][0]
-    turned = affine[:3, :3] @ page["g"][0]
+    place = volume.ijk_to_lps([page["ijk"].values])
+    np.testing.assert_allclose(volume.lps_to_ijk(place), [page["ijk"].values], atol=1e-9)
+    gradient = normal_matrix(affine) @ page["g"].values
+    turned = affine[:3, :3] @ page["g"].values
     lost = step - (step @ normal) * normal
-    i, j, _ = page["ijk"][0]
+    i, j, _ = page["ijk"].values
     swap = (affine[:3, 0] / 0.5 * i - affine[:3, 1] / 0.7 * j) * (0.7 - 0.5)
     return {
         "Δi": volume.spacing[0],
@@ -112,22 +120,22 @@ def compute_page(page, volume: Volume) -> dict[str, np.ndarray]:
 
 
 def compute_uneven_slices(page) -> dict[str, np.ndarray]:
-    in_plane = np.array(page["ImageOrientationPatient"][0]).reshape(2, 3)
-    dj, di = page["PixelSpacing"][0]
-    positions = np.array([page[f"U_{k}"][0] for k in range(3)])
+    in_plane = np.array(page["ImageOrientationPatient"].values).reshape(2, 3)
+    dj, di = page["PixelSpacing"].values
+    positions = np.array([page[f"U_{k}"].values for k in range(3)])
     steps = (in_plane[0] * di, in_plane[1] * dj)
     nominal = compose_affine(*steps, (positions[2] - positions[0]) / 2, positions[0])
     volume = Volume(np.zeros((3, 4, 6), np.int16), nominal, slice_positions=positions)
-    c = page["c"][0]
+    c = page["c"].values
     slopes = [c @ step for step in steps]
     central, within = c @ (positions[2] - positions[0]) / 2, c @ (positions[2] - positions[1])
     found = {
-        "U_P": volume.ijk_to_lps([page["U_ijk"][0]])[0],
+        "U_P": volume.ijk_to_lps([page["U_ijk"].values])[0],
         "g_slice": np.array([*slopes, central]),
         "g_layer": np.array([*slopes, within]),
     }
-    np.testing.assert_allclose(slice_normal_matrices(volume, 0)[1] @ found["g_slice"], c, atol=1e-9)
-    np.testing.assert_allclose(layer_normal_matrices(volume, 0)[1] @ found["g_layer"], c, atol=1e-9)
+    np.testing.assert_allclose(slice_normal_matrices(volume, border=0)[1] @ found["g_slice"], c, atol=1e-9)
+    np.testing.assert_allclose(layer_normal_matrices(volume, border=0)[1] @ found["g_layer"], c, atol=1e-9)
     return found
 
 
@@ -149,16 +157,16 @@ def test_every_number_of_the_page_is_what_the_code_gives_to_its_last_digit(page,
 
 def test_the_worked_case_is_right_handed_and_warned_of_with_the_tilt_of_the_page(page, volume):
     assert not is_left_handed(volume.affine)
-    assert any(f"gantry tilt -{page['tilt'][0]:.2f} degrees" in text for text in volume.report["warnings"])
+    assert any(f"gantry tilt -{page['tilt'].values:.2f} degrees" in text for text in volume.report["warnings"])
 
 
 @pytest.mark.parametrize("k", range(5))
 def test_corners_of_each_slice_lie_where_the_standard_puts_them(page, volume, k):
     """PS3.3 C.7.6.2.1.1 with nothing of clrecon in it; what is left is the residual of the fit."""
-    cosines, (dj, di) = page["ImageOrientationPatient"][0], page["PixelSpacing"][0]
+    cosines, (dj, di) = page["ImageOrientationPatient"].values, page["PixelSpacing"].values
     residual, half_a_digit = page["residual_max"]
     for i, j in ((0, 0), (5, 0), (0, 3), (5, 3)):
-        expected = page[f"S_{k}"][0] + np.array(cosines[:3]) * di * i + np.array(cosines[3:]) * dj * j
+        expected = page[f"S_{k}"].values + np.array(cosines[:3]) * di * i + np.array(cosines[3:]) * dj * j
         assert np.linalg.norm(volume.ijk_to_lps([(i, j, k)])[0] - expected) <= residual + half_a_digit
 
 
@@ -166,9 +174,9 @@ def test_indented_numbers_of_a_page_are_read_with_half_a_unit_of_their_last_digi
     text = "    s = (0.493, -0.655, 0.980)\n    A = [ 1 2 ]\n        [ 3.5 4 ]\n    tilt = 13.5\nno = 3\n"
     numbers = read_numbers(text)
     assert set(numbers) == {"s", "A", "tilt"}
-    assert numbers["A"][0].tolist() == [[1, 2], [3.5, 4]]
-    assert numbers["A"][1] == 0.5
-    assert numbers["s"][1] == pytest.approx(0.0005)
+    assert numbers["A"].values.tolist() == [[1, 2], [3.5, 4]]
+    assert numbers["A"].half_a_digit == 0.5
+    assert numbers["s"].half_a_digit == pytest.approx(0.0005)
 
 
 def test_a_slice_step_that_is_wrong_in_its_third_digit_is_off_by_more_than_its_last_digit(computed):
