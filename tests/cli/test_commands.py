@@ -190,7 +190,7 @@ def test_least_volume_above_all_components_is_refused_and_writes_nothing(
     assert not (tmp_path / "none.stl").exists()
 
 
-def test_several_meshes_of_one_job_are_printed_one_by_one(
+def test_several_meshes_of_one_job_are_written_and_printed_one_by_one(
     device: Any, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arguments = ["mesh", str(ct), "-o", str(tmp_path / "a.stl"), "--split", "-v", "--device", str(device.index)]
