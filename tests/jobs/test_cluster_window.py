@@ -93,6 +93,7 @@ def in_capitals(item: str, error: Exception | None = None) -> str:
 
 
 def run_all(client: FakeClient, items: str, *shared: Any, function: Callable[..., Any] = in_capitals) -> dict[str, Any]:
+    """Run a function on each word of `items` and with what all share; return the results by word."""
     return dict(Cluster(client, "tcp://far:8786", print).run_tasks(function, items.split(), *shared))
 
 

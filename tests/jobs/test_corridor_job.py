@@ -78,20 +78,20 @@ def test_surface_of_the_bone_of_a_vertebra_is_fitted_within_a_fraction_of_a_voxe
     off_mm = fitted_vertebra.vertebra.depth(fitted_vertebra.bone.surface)
 
     assert abs(np.median(off_mm)) < 0.06  # voxels of 1 mm; at the level of 150 HU it is 0.35
-    assert np.abs(off_mm).mean() < 0.12
+    assert np.abs(off_mm).mean() < 0.1  # measured 0.053
 
 
 def test_most_of_the_surface_of_the_bone_is_placed_by_hu(fitted_vertebra: FittedVertebra) -> None:
     assert fitted_vertebra.bone.fitted
-    assert fitted_vertebra.bone.by_hu.mean() > 0.95  # the rest lies where pedicles meet the body
+    assert fitted_vertebra.bone.by_hu.mean() > 0.99  # measured 1
 
 
 def test_bone_of_a_vertebra_is_solid_to_half_a_mm_from_its_surface(fitted_vertebra: FittedVertebra) -> None:
     solid = fitted_vertebra.bone.solid[tuple(fitted_vertebra.places.T)]
     inside, outside = fitted_vertebra.depth_mm > 0.5, fitted_vertebra.depth_mm < -0.5
 
-    assert solid[inside].mean() > 0.999
-    assert solid[outside].mean() < 0.001
+    assert solid[inside].all()
+    assert not solid[outside].any()
 
 
 def test_label_with_too_little_bone_to_be_fitted_is_refused_with_its_name(tmp_path: Path, device: Any) -> None:
@@ -116,17 +116,20 @@ def test_corridors_of_bone_with_a_fitted_surface_have_the_radius_of_the_truth(
 
     report = load(tmp_path / "r.json")
     assert (report["surface"], report["iso_value_hu"]) == ("cortex", 200.0)
-    for side in report["vertebrae"][0]["corridors"]:
-        assert side["radius_mm"] == pytest.approx(true_radius_mm(side), abs=0.2)  # of voxels of 0.9 x 0.9 x 1.25 mm
+    (vertebra,) = report["vertebrae"]
+    for side in vertebra["corridors"]:
+        assert side["radius_mm"] == pytest.approx(true_radius_mm(side), abs=0.05)  # measured 0.016
         assert side["level_bias_mm"] is None  # there is no level
-        assert side["placed_by_hu_share"] > 0.9
+        assert side["placed_by_hu_share"] > 0.99  # measured 1
 
 
 def run(*arguments: object) -> int:
+    """Run ``clrecon corridor`` with these arguments; return the exit code."""
     return main([str(argument) for argument in ("corridor", *arguments)])
 
 
 def load(path: Path) -> dict[str, Any]:
+    """Read a report."""
     return dict(json.loads(path.read_text()))
 
 
@@ -219,7 +222,7 @@ def test_corridor_has_the_radius_and_angles_of_a_lumbar_pedicle(reported: Any) -
 
 @pytest.mark.slow
 def test_bias_of_the_level_is_estimated_from_many_rays(reported: Any) -> None:
-    assert min(side["level_bias_mm"]["rays"] for side in reported.sides) > 60
+    assert min(side["level_bias_mm"]["rays"] for side in reported.sides) > 60  # measured 118
 
 
 @pytest.mark.slow
@@ -361,14 +364,9 @@ def test_cylinder_mesh_is_closed_and_outward_with_the_volume_of_a_cylinder() -> 
     ],
 )
 def test_wrong_arguments_of_corridor_are_refused_in_one_line_and_write_nothing(
-    ct: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    arguments: tuple[str, ...],
-    code: int,
-    said: str,
-) -> None:
+    ct: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
+    arguments: tuple[str, ...], code: int, said: str,
+) -> None:  # fmt: skip
     monkeypatch.chdir(tmp_path)
 
     assert run(ct, "--labels", ct / "levels.nrrd", *arguments) == code

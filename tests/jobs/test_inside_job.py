@@ -83,7 +83,8 @@ def test_report_of_inside_has_the_size_of_each_mesh_file(inside_of_l1: InsideRun
 
 @pytest.mark.release
 def test_inside_prints_the_volumes_of_its_report_and_the_files(inside_of_l1: InsideRun) -> None:
-    volumes = inside_of_l1.report["vertebrae"][0]["volumes_ml"]
+    (vertebra,) = inside_of_l1.report["vertebrae"]
+    volumes = vertebra["volumes_ml"]
     lines = inside_of_l1.output
 
     assert f"solid {volumes['solid']:.2f} ml (label), canal {volumes['canal']:.2f} ml" in lines
@@ -132,7 +133,8 @@ def test_solid_bone_within_the_fitted_surface_has_the_volume_of_the_true_label(
     volume_ml = {}
     for solid, options in {"label": (), "200 HU": ("--hu", "200"), "cortex": ("--surface", "cortex")}.items():
         assert run_inside("--label", "L1", *options, "--json", output=f"{solid}.stl") == 0
-        volume_ml[solid] = printed().report()["vertebrae"][0]["volumes_ml"]["solid"]
+        (vertebra,) = printed().report()["vertebrae"]
+        volume_ml[solid] = vertebra["volumes_ml"]["solid"]
 
     assert volume_ml["cortex"] == pytest.approx(volume_ml["label"], rel=0.03)  # measured 0.006
     assert volume_ml["200 HU"] > 1.1 * volume_ml["label"]  # blur puts 200 HU outside of the bone: measured 1.14

@@ -34,6 +34,7 @@ def sphere_and_truth(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, di
 
 @pytest.fixture(scope="module")
 def sphere(sphere_and_truth: tuple[Path, dict[str, Any]]) -> Path:
+    """The folder of the CT of a sphere."""
     folder, _ = sphere_and_truth
     return folder
 

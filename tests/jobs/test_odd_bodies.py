@@ -61,9 +61,9 @@ def test_mesh_without_the_table_has_the_vertices_of_all_dense_tissue_of_the_body
     _, vertices = mesh_of(odd, device, tmp_path, name, iso_value=300.0, remove_table=True, strict=True)
     _, with_table = mesh_of(odd, device, tmp_path, name, iso_value=300.0)
 
-    assert share_near(body, vertices, *DENSE) > 0.8  # the rest is skin and table in the margin
+    assert share_near(body, vertices, *DENSE) > 0.98  # measured from 0.990 on; the rest is table in the margin
     count, of_all = (vertices_away_from_the_table(body, some, *DENSE) for some in (vertices, with_table))
-    assert count == pytest.approx(of_all, rel=0.02)
+    assert count == of_all
 
 
 @pytest.mark.release
@@ -115,7 +115,7 @@ def test_water_without_its_table_has_its_surface_at_the_level_of_skin(
     odd: OddBodies, device: Any, tmp_path: Path
 ) -> None:
     _, vertices = mesh_of(odd, device, tmp_path, "water", iso_value=-300.0, remove_table=True, keep_largest=1)
-    assert share_near(odd["water"], vertices, "water") > 0.7  # the rest lies on its shell
+    assert share_near(odd["water"], vertices, "water") > 0.95  # measured 0.983; the rest lies on its shell
 
 
 @pytest.mark.parametrize("name", daily(4, BODIES))
@@ -156,7 +156,8 @@ def test_auto_iso_value_lies_on_bone_or_table_or_is_refused_with_figures(
         return
     choice = report["iso_value_choice"]
     assert choice["tissue_hu"] < report["iso_value_hu"] < choice["bone_hu"]
-    assert share_near(odd[name], vertices, "bone", "metal", "table") > 0.9  # rails of a table are hard too
+    # Rails of a table are hard too: measured from 0.9957 on.
+    assert share_near(odd[name], vertices, "bone", "metal", "table") > 0.99
 
 
 def test_auto_iso_value_of_a_trunk_with_contrast_medium_states_its_share(

@@ -26,8 +26,8 @@ def works(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[str, Work
     voxels, affine, _ = make_phantom(PhantomSettings(size=(160, 144), slices=60, spacing=(1.9, 1.8, 2.5)))
     volume = Volume(voxels, affine)
     vertices, triangles = torus(rings=60, sides=32)
-    mesh = Mesh(vertices, triangles, None, {"affine_ijk_to_lps_mm": np.eye(4).tolist()})
-    other = Mesh(vertices + 0.1, triangles, None, {})
+    mesh = Mesh(vertices, triangles, report={"affine_ijk_to_lps_mm": np.eye(4).tolist()})
+    other = Mesh(vertices + 0.1, triangles)
     labels = write_nifti(tmp_path_factory.mktemp("labels") / "labels.nii", make_labels(), np.eye(4))
     return {
         "choose_iso_value": ("choose", lambda **own: clrecon.choose_iso_value(volume, **own)),

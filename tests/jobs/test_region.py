@@ -50,6 +50,7 @@ def to_lps(ijk: Any) -> np.ndarray:
 
 
 def box_around(centre: np.ndarray, half_side_mm: float, space: str = "lps") -> str:
+    """The rule of a region that is a cube about a place in index coordinates (i, j, k)."""
     low, high = to_lps(centre) - half_side_mm, to_lps(centre) + half_side_mm
     if space == "ras":
         low[:2], high[:2] = -high[:2], -low[:2]
@@ -195,7 +196,7 @@ def test_steps_and_the_region_among_them_are_reported_in_their_order(mesh_with: 
     assert [step["step"] for step in steps] == ["bilateral:0.8:30", "region", "level:250", "fill"]
     assert fill["band_hu"] == [250.0, None]  # of the level set before
     assert all(step["seconds"] >= 0.0 for step in steps)
-    assert report["volume"]["region"]["rules"] == [str(parse_region_rules(box)[0])]
+    assert report["volume"]["region"]["rules"] == [str(rule) for rule in parse_region_rules(box)]
 
 
 @pytest.mark.parametrize(
@@ -247,7 +248,7 @@ def test_cloud_has_the_points_in_the_region(device: Any, scan: Path, tmp_path: P
 
     assert main([*command, "--region", box]) == 0
 
-    assert printed().report()["volume"]["region"]["rules"] == [str(parse_region_rules(box)[0])]
+    assert printed().report()["volume"]["region"]["rules"] == [str(rule) for rule in parse_region_rules(box)]
     points = np.asarray(read_points(str(tmp_path / "c.ply")).points)
     assert len(points) > 100  # 568 were measured; the ball has 4/3 pi 5.2^3 = 589 voxels
     assert np.abs(points - to_lps(SMALL)).max() < HALF_SIDE_MM + VOXEL_MM

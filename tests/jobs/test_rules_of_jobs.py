@@ -202,7 +202,7 @@ def test_file_turned_from_ras_has_a_warning_before_its_own() -> None:
 
 def read_input(*reports: dict[str, Any]) -> Any:
     """What a file of a box for each report gives."""
-    return SimpleNamespace(meshes=[Mesh(*samples.box(), None, report) for report in reports])
+    return SimpleNamespace(meshes=[Mesh(*samples.box(), report=report) for report in reports])
 
 
 def test_single_mesh_of_a_page_gets_no_name_and_no_colour() -> None:

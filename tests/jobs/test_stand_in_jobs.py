@@ -11,7 +11,7 @@ from variants import daily
 
 from clrecon.cli.main import main
 
-NEVER_LAST = 1 << 30
+NEVER = 1 << 30
 
 COMMANDS = {
     "mesh": ("out.stl", ("--hu", "200", "--keep-largest", "1")),
@@ -33,9 +33,9 @@ def gpu(device, monkeypatch):
 @pytest.mark.fault_row(54)
 @pytest.mark.seconds
 @pytest.mark.parametrize("command", COMMANDS)
-@pytest.mark.parametrize("first", daily(1, [1, 2]))
+@pytest.mark.parametrize("first_to_fail", daily(1, [1, 2]))
 def test_job_whose_device_fails_is_done_again_on_the_cpu_device_with_a_warning(
-    device, gpu, tmp_path, capsys, monkeypatch, command, first
+    device, gpu, tmp_path, capsys, monkeypatch, command, first_to_fail
 ):
     output, options = COMMANDS[command]
     write_series(tmp_path / "ct")
@@ -44,7 +44,7 @@ def test_job_whose_device_fails_is_done_again_on_the_cpu_device_with_a_warning(
     assert main([*arguments, "-o", str(tmp_path / "alone" / output), "--device", str(device.index)]) == 0
     capsys.readouterr()
     with monkeypatch.context() as patch:
-        Failing(patch, "launch", first, NEVER_LAST, label=gpu.label)
+        Failing(patch, "launch", first=first_to_fail, last=NEVER, label=gpu.label)
         report = tmp_path / "report.json"
         assert main([*arguments, "-o", str(tmp_path / output), "--report", str(report)]) == 0
     said = capsys.readouterr()
@@ -61,7 +61,7 @@ def test_job_on_a_named_device_that_fails_is_refused_with_the_number_of_the_cpu_
 ):
     name, options = COMMANDS[command]
     write_series(tmp_path / "ct")
-    Failing(monkeypatch, "launch", 3, NEVER_LAST, label=gpu.label)
+    Failing(monkeypatch, "launch", first=3, last=NEVER, label=gpu.label)
     output: Path = tmp_path / name
     assert main([command, str(tmp_path / "ct"), "-o", str(output), *options, "--device", "gpu"]) == 5
     printed().assert_error("--device", device.index)
@@ -73,7 +73,7 @@ def test_job_whose_device_is_lost_is_done_again_on_it_in_a_new_context(gpu, tmp_
     write_series(tmp_path / "ct")
     # nothing is tried beside the reading: the launch that fails is one of the work
     monkeypatch.setattr("clrecon.jobs.mesh.make._try_steps", lambda device, settings: None)
-    Failing(monkeypatch, "launch", 3, label=gpu.label, error=lost_error())
+    Failing(monkeypatch, "launch", first=3, label=gpu.label, error=lost_error())
     assert main(["mesh", str(tmp_path / "ct"), "-o", str(tmp_path / "out.stl"), "--hu", "200"]) == 0
     said = printed()
     said.assert_error("again", "context")

@@ -163,7 +163,7 @@ def test_part_of_a_canal_shifted_beyond_a_slice_is_left_out(step):
     di, dj = step
     nj, ni = 3, 4
     places = _Places(Volume(np.zeros((2, nj, ni), np.int16), np.eye(4)))
-    shifted = places.shift(np.ones((nj, ni), bool), 0, 1, np.array(step, float))
+    shifted = places.shift(np.ones((nj, ni), bool), source=0, target=1, slope=np.array(step, float))
     expected = np.zeros((nj, ni), bool)
     expected[max(0, dj) : nj + min(0, dj), max(0, di) : ni + min(0, di)] = True
     assert np.array_equal(shifted, expected)

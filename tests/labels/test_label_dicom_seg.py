@@ -43,6 +43,7 @@ def assert_segments_on_scan(path, volume, segments):
 
 
 def ct_volume(tmp_path, plan=PLAN):
+    """Write a CT and read it."""
     dicom_series.write_series(tmp_path / "ct", plan)
     return read_volume(tmp_path / "ct")
 
@@ -234,6 +235,7 @@ def change_groups(path, change):
         (lambda s, f: setattr(s.PixelMeasuresSequence[0], "PixelSpacing", [0, 1]), "cannot be placed"),
         (lambda s, f: setattr(f[1].SegmentIdentificationSequence[0], "ReferencedSegmentNumber", 9), "segment 9, which"),
     ],
+    ids=["uneven places", "place without numbers", "no place", "no direction", "no spacing", "unknown segment"],
 )
 def test_segmentation_with_a_frame_of_unknown_place_or_segment_is_refused(tmp_path, change, message):
     path = change_groups(write_seg(tmp_path / "a.dcm", masks_of_two(), ct_slices(PLAN)), change)

@@ -57,6 +57,7 @@ MASKS = {
 
 
 def surface_error(vertices, radius):
+    """How far each vertex lies outside of the sphere, in voxels."""
     return np.linalg.norm(vertices - CENTER, axis=1) - radius
 
 
@@ -70,6 +71,7 @@ HALF_WAY = 0
 
 
 def extract_label_1(volume, labels, level, **options):
+    """Vertices, normals and triangles of label 1, grown and solid as the options of `find_solid` say."""
     return extract_label(volume, find_solid(volume, labels.astype(np.uint16), level, **options), 1, level)
 
 
@@ -170,9 +172,9 @@ def count_faces_between_4_and_9(inside):
 @pytest.mark.parametrize("solid", [(), (4, 9)], ids=["plain", "solid"])
 def test_surfaces_of_touching_labels_are_closed_and_manifold(solid):
     volume, labels = block_of_labels_4_and_9()
-    inside = find_solid(volume, labels, 300, solid=solid)
+    inside = find_solid(volume, labels, iso_value=300, solid=solid)
     for number in (4, 9):
-        quality = measure_quality(extract_label(volume, inside, number, 300))
+        quality = measure_quality(extract_label(volume, inside, number, iso_value=300))
         assert quality["closed"]
         assert quality["manifold"]
 
@@ -180,10 +182,9 @@ def test_surfaces_of_touching_labels_are_closed_and_manifold(solid):
 @pytest.mark.parametrize("solid", [(), (4, 9)], ids=["plain", "solid"])
 def test_surfaces_of_touching_labels_share_a_vertex_for_each_face_between_their_samples(solid):
     volume, labels = block_of_labels_4_and_9()
-    inside = find_solid(volume, labels, 300, solid=solid)
-    of_4, of_9 = (
-        {tuple(vertex) for vertex in extract_label(volume, inside, number, 300)[0].tolist()} for number in (4, 9)
-    )
+    inside = find_solid(volume, labels, iso_value=300, solid=solid)
+    (of_4, *_), (of_9, *_) = (extract_label(volume, inside, number, iso_value=300) for number in (4, 9))
+    of_4, of_9 = ({tuple(vertex) for vertex in vertices.tolist()} for vertices in (of_4, of_9))
     assert len(of_4 & of_9) == count_faces_between_4_and_9(inside)
     assert count_faces_between_4_and_9(inside) > 20  # the labels touch over some 5 x 8 samples
 
@@ -193,7 +194,8 @@ def test_surface_towards_dense_bone_of_no_label_lies_half_way_between_the_sample
     hu = np.where(volume.voxels > 0, 500, volume.voxels).astype(np.int16)
     even_bone = Volume(hu, np.eye(4))
 
-    vertices, normals, _ = extract_label(even_bone, find_solid(even_bone, labels, 300), 9, 300)
+    inside = find_solid(even_bone, labels, iso_value=300)
+    vertices, normals, _ = extract_label(even_bone, inside, number=9, iso_value=300)
 
     last_sample = 9 + 1  # of label 9 along x, and its growth; the bone goes on to sample 11
     half_way = np.abs(vertices[:, 0] - (last_sample + 0.5)) < tolerances.EQUAL_DISTANCE_MM

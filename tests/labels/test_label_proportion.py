@@ -87,6 +87,7 @@ def test_commands_refuse_a_large_map_out_of_proportion_in_one_line_and_write_not
 
 
 def write_map_of_16_slices(path: Path) -> Path:
+    """Write a map of 8 x 8 x 16 voxels of a byte, some of them of label 1."""
     nibabel = pytest.importorskip("nibabel")
     labels_ijk = np.zeros((8, 8, 16), np.uint8)
     labels_ijk[2:4, 2:4, 2:4] = 1

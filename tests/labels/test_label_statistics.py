@@ -81,12 +81,14 @@ UNEVEN_MM = (HEIGHTS[3:6] - HEIGHTS[1:4]) / 2.0  # half way to the slices on eit
 
 
 def measure_on_uneven_slices(percentiles: tuple[float, ...] = (50,)) -> tuple[LabelFigures, Volume]:
+    """The figures of label 3, and the scan."""
     voxels = np.repeat(np.array([0, 100, 200, 300, 400, 500], np.int16), 20).reshape(6, 5, 4)
     volume = uneven(voxels)
     labels = np.zeros(voxels.shape, np.uint8)
     labels[UNEVEN_SLICES, 1:4, 1:3] = 3
     evenly_placed = LabelMap(labels, volume.affine)
-    on_scan = ResampledLabels(labels, True, {3: 1.0}, ())  # on the scan's own slices, which no file of labels can say
+    # On the scan's own slices, which no file of labels can say.
+    on_scan = ResampledLabels(labels, exact=True, inside={3: 1.0}, warnings=())
     (figures,) = measure_resampled(volume, evenly_placed, on_scan, percentiles=percentiles)
     return figures, volume
 

@@ -16,6 +16,7 @@ SHEARED = np.array([[0.7, 0.1, 0.4, -250.0], [-0.1, 0.5, 0.9, -300.0], [0.0, 0.0
 
 
 def map_of_24_voxels() -> np.ndarray:
+    """Label 7 in a block of 2 x 3 x 4 voxels."""
     voxels = np.zeros((4, 5, 6), np.uint8)
     voxels[1:3, 1:4, 2:6] = 7
     return voxels

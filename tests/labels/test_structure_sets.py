@@ -431,10 +431,13 @@ def scan_with_structure_set(tmp_path):
 @pytest.mark.first_device
 def test_commands_mesh_and_render_take_structure_sets_as_labels(scan_with_structure_set, tmp_path, printed):
     scan, path = scan_with_structure_set
-    mesh = ["mesh", scan, "-o", str(tmp_path / "a.stl"), "--surface", "mask", "--labels", path, "-q"]
-    assert main(mesh) == 0, printed()
-    picture = ["render", scan, "-o", str(tmp_path / "p.png"), "--size", "64", "--labels", path, "-q"]
-    assert main(picture) == 0, printed()
+    mesh = ["mesh", scan, "-o", str(tmp_path / "a.stl"), "--surface", "mask", "--labels", path, "--json"]
+    assert main(mesh) == 0
+    assert [mesh["label"] for mesh in printed().report()["meshes"]] == ["L3"]
+    middle_slice = ["render", scan, "-o", str(tmp_path / "p.png"), "--mode", "slice", "--labels", path, "--json"]
+    assert main(middle_slice) == 0
+    (picture,) = printed().report()["pictures"]
+    assert [label["label"] for label in picture["labels"]] == ["L3"]
 
 
 @pytest.mark.release

@@ -59,6 +59,7 @@ def start_batch(folder: Path, *options: str, prepare: Callable[[], None] | None 
 
 
 def statuses(folder: Path) -> dict[str, str]:
+    """Status of each case in the table of the cohort."""
     with (folder / "out" / "cohort.csv").open(newline="") as stream:
         return {row["case"]: row["status"] for row in csv.DictReader(stream)}
 

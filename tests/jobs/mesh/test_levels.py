@@ -89,7 +89,8 @@ def test_mesh_of_two_given_materials_has_the_iso_value_half_way_between_them(dev
     assert report["iso_value_hu"] == (1000 + 40) / 2
     assert report["iso_value_reason"] == "half way between tissue 40 and bone 1000 HU, as given"
     assert report["iso_value_choice"]["edges"] is None  # none was looked at
-    assert report["meshes"][0]["name"] == "001"
+    (mesh,) = report["meshes"]
+    assert mesh["name"] == "001"
     assert report["warnings"] == []
 
 
@@ -117,7 +118,8 @@ def warn_of_auto_level(slice_spacing_mm: float) -> list[str]:
     """Warnings for the iso value that ``half_way="auto"`` chooses in the ball with slices so far apart."""
     volume = Volume(ball().voxels, np.diag((1.0, 1.0, slice_spacing_mm, 1.0)))
     settings = MeshSettings(half_way="auto")
-    return describe_level(volume, settings, choose_level(volume, settings))[1]
+    _, warnings = describe_level(volume, settings, choose_level(volume, settings))
+    return warnings
 
 
 def test_auto_in_slices_3_mm_apart_is_warned_of_with_its_iso_value() -> None:
@@ -173,7 +175,7 @@ VALUES_0_TO_999 = np.arange(1000, dtype=np.int16).reshape(10, 10, 10)
 
 @pytest.mark.parametrize("report", [None, {}], ids=["no report", "an empty report"])
 def test_level_within_a_volume_made_from_an_array_is_accepted(report: dict[str, Any] | None) -> None:
-    check_levels(Volume(VALUES_0_TO_999, np.eye(4), report), plan_surfaces([500.0]))
+    assert check_levels(Volume(VALUES_0_TO_999, np.eye(4), report), plan_surfaces([500.0])) is None
 
 
 @pytest.mark.parametrize("report", [None, {}], ids=["no report", "an empty report"])

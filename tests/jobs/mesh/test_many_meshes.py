@@ -77,7 +77,7 @@ def test_one_mesh_of_all_components_is_one_file_without_a_name_of_its_own(device
 
 @pytest.mark.usefixtures("boxes")
 def test_each_of_several_iso_values_gives_the_file_and_figures_that_it_gives_alone(device: Any, tmp_path: Path) -> None:
-    alone = mesh_boxes(tmp_path, device, iso_value=500.0)["meshes"][0]
+    (alone,) = mesh_boxes(tmp_path, device, iso_value=500.0)["meshes"]
     file_alone = (tmp_path / "bone.ply").read_bytes()
 
     at_200, at_500 = mesh_boxes(tmp_path, device, iso_value=(200.0, 500.0))["meshes"]
@@ -212,11 +212,11 @@ def test_components_that_do_not_fit_the_device_are_found_without_it_with_a_warni
 
 @pytest.mark.usefixtures("boxes")
 def test_bounds_in_ras_are_those_in_lps_with_x_and_y_turned(device: Any, tmp_path: Path) -> None:
-    low, high = mesh_boxes(tmp_path, device, iso_value=(200.0, 500.0))["meshes"][1]["bounds_mm"]
+    _, at_500 = mesh_boxes(tmp_path, device, iso_value=(200.0, 500.0))["meshes"]
+    _, at_500_in_ras = mesh_boxes(tmp_path, device, iso_value=(200.0, 500.0), space="ras")["meshes"]
 
-    ras = mesh_boxes(tmp_path, device, iso_value=(200.0, 500.0), space="ras")["meshes"][1]["bounds_mm"]
-
-    np.testing.assert_allclose(ras, [[-high[0], -high[1], low[2]], [-low[0], -low[1], high[2]]])
+    low, high = at_500["bounds_mm"]
+    np.testing.assert_allclose(at_500_in_ras["bounds_mm"], [[-high[0], -high[1], low[2]], [-low[0], -low[1], high[2]]])
 
 
 @pytest.mark.usefixtures("boxes")
@@ -311,7 +311,8 @@ def test_surface_of_a_range_encloses_the_box_of_its_hu_half_a_unit_beyond_its_en
 
     assert report["components"] == 1  # the small box of 300 HU
     assert report["iso_value_hu"] is None
-    assert report["meshes"][0]["inside_levels_hu"] == [99.5, 300.5]
+    (mesh,) = report["meshes"]
+    assert mesh["inside_levels_hu"] == [99.5, 300.5]
     assert all(gate["ok"] is not False for gate in report["gates"])
 
 

@@ -79,6 +79,7 @@ def test_a_print_without_walls_of_bone_has_its_own_alone(
     volume = draw_plate(thickness_mm=2.0)
     metal = volume.with_voxels(np.where(volume.voxels > 500, 3000, volume.voxels).astype(np.int16))
     _, report = print_plate(tmp_path, device, metal, "--hu", "1800")
+    # Of metal of 2 mm, blurred, and no bone.
     assert report["print"]["bone_wall"] is None and report["print"]["wall"]["median_mm"] > 1.0
     told = capsys.readouterr().out
     assert "walls of the print: " in told and "walls of the bone" not in told

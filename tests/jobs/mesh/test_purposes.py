@@ -210,7 +210,7 @@ def test_print_of_a_torus_is_one_closed_piece_with_its_size_volume_and_walls(
     size = np.ptp(np.array(report["bounds_mm"]), axis=0)
     np.testing.assert_allclose(facts["size_mm"], size, atol=1e-4)  # float32 coordinates of some 100 mm
     assert "print    size " + " x ".join(f"{length:.1f}" for length in size) in capsys.readouterr().out
-    assert facts["pieces_ml"] == pytest.approx(report["volume_ml"], rel=0.01)
+    assert facts["pieces_ml"] == pytest.approx(report["volume_ml"], rel=1e-5)  # float32
     assert 0.0 < facts["wall"]["p5_mm"] <= facts["wall"]["median_mm"] <= size.max()
 
 
@@ -247,7 +247,8 @@ def test_command_for_paper_b_reports_its_steps_method_and_cells(device: Any, tmp
     steps = [step["step"] for step in report["volume"]["preprocess"]]
     assert steps == ["bilateral-2d", "open:1", "region"]
     assert (report["method"], report["vertex_rule"]) == ("i-mc", "golden")
-    cells = report["meshes"][0]["cells"]
+    (mesh,) = report["meshes"]
+    cells = mesh["cells"]
     assert 0 < cells["active"] <= cells["all"]
     printed().assert_output("cells")
     assert any("0.618 of their edges" in warning for warning in report["warnings"])  # where the rule puts vertices
@@ -292,7 +293,7 @@ def test_gate_of_the_iso_distance_is_judged_without_what_is_near_metal_and_says_
     (gate,) = (gate for gate in report["gates"] if gate["name"] == "iso_distance_p95")
 
     assert code == 0
-    assert 0.2 < found["near_metal_share"] < 0.35  # a quarter, as the docstring says
+    assert 0.24 < found["near_metal_share"] < 0.3  # measured 0.268
     whole, away = found["vertices_voxel"]["p95"], found["away_from_metal_voxel"]["p95"]
     assert whole > gate["bound"] > 1.5 * away
     assert gate["measured"] == away

@@ -31,6 +31,7 @@ def noisy_torus(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[st
 
 
 def failed_gates(report: dict[str, Any]) -> list[str]:
+    """Names of the gates that failed."""
     return [gate["name"] for gate in report["gates"] if gate["ok"] is False]
 
 

@@ -67,7 +67,8 @@ def test_picture_and_depths_of_a_cloud_by_the_command_are_those_of_the_function(
 def test_report_of_a_picture_of_a_cloud_has_its_look_and_counts_the_points_of_each_colour(drawn_folder: Path) -> None:
     report = json.loads((drawn_folder / "r.json").read_text())
 
-    points = report["pictures"][0]["points"]
+    (picture,) = report["pictures"]
+    points = picture["points"]
     assert (points["radius_mm"], points["color_by"], points["shading"]) == (0.4, "removed", "normals")
     reasons = [entry["name"] for entry in points["legend"]]
     assert reasons == [None, "kept", None, None]  # of the labels -1 to 2 only 0 has a name

@@ -71,9 +71,9 @@ def area_cm2(volume: Volume, mask: np.ndarray) -> float:
 
 
 def check_area(volume: Volume, picture: Rendering, mask: np.ndarray, alike: float) -> None:
-    """What is drawn lies within a voxel of the mask and covers it."""
+    """Assert that what is drawn lies within a voxel of the mask and covers it."""
     k, j, i = place_points(volume, picture)
-    assert ndimage.binary_dilation(mask, np.ones((3, 3, 3)))[k, j, i].mean() > 0.9
+    assert ndimage.binary_dilation(mask, np.ones((3, 3, 3)))[k, j, i].mean() > 0.95  # measured from 0.972 on
     assert picture.pixel_mm is not None
     assert len(k) * picture.pixel_mm**2 / 100.0 == pytest.approx(area_cm2(volume, mask), rel=alike)
 

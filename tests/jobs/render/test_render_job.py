@@ -40,6 +40,7 @@ def sphere_and_truth(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, di
 
 @pytest.fixture(scope="module")
 def sphere(sphere_and_truth: tuple[Path, dict[str, Any]]) -> Path:
+    """The folder of the CT of a sphere."""
     folder, _ = sphere_and_truth
     return folder
 
@@ -102,7 +103,8 @@ def test_views_fit_scales_of_their_own_which_zoom_makes_one(
     assert min(fitted.values()) < 0.95 * largest  # measured 0.76: they differ
     for view, pixel_mm in fitted.items():
         alone = make_pictures(sphere, files, replace(settings, views=(view,), zoom=pixel_mm / largest))
-        assert alone["pictures"][0]["pixel_mm"] == pytest.approx(largest, rel=1e-4)
+        (picture,) = alone["pictures"]
+        assert picture["pixel_mm"] == pytest.approx(largest, rel=1e-9)  # float64
 
 
 @pytest.fixture(scope="module")
@@ -298,7 +300,8 @@ def test_picture_of_a_volume_in_slabs_is_that_of_the_whole(device: Any, sphere: 
     def draw_with(memory: int | None) -> tuple[int, np.ndarray]:
         settings = RenderSettings.of(size=SIZE, views=("30,20",), device=str(device.index), memory=memory)
         report = make_pictures(sphere, PictureFiles(tmp_path / "a.png"), settings)
-        return report["pictures"][0]["slabs"], np.asarray(Image.open(tmp_path / "a.png")).astype(int)
+        (picture,) = report["pictures"]
+        return picture["slabs"], np.asarray(Image.open(tmp_path / "a.png")).astype(int)
 
     slabs_of_whole, whole = draw_with(memory=None)
     slabs, in_slabs = draw_with(memory=250_000)
@@ -315,7 +318,7 @@ def test_x_ray_is_a_sum_in_mm_of_water_with_a_window_within_its_values(
 
     report = make_pictures(sphere, PictureFiles(tmp_path / "a.png", values=tmp_path / "v.npy"), settings)
 
-    picture, most_mm = report["pictures"][0], float(np.load(tmp_path / "v.npy").max())
+    (picture,), most_mm = report["pictures"], float(np.load(tmp_path / "v.npy").max())
     assert report["mode"] == "drr"
     assert (picture["values_hu"], picture["window_hu"]) == (None, None)
     assert picture["values_mm_water"] == [0.0, pytest.approx(most_mm)]
@@ -330,7 +333,7 @@ def test_given_window_of_an_x_ray_is_in_mm_of_water(device: Any, sphere: Path, t
     twice_the_most_mm = 2.0 * float(np.load(tmp_path / "v.npy").max())
 
     windowed = replace(settings, style=Projection("drr", window=(0.0, twice_the_most_mm)))
-    picture = make_pictures(sphere, files, windowed)["pictures"][0]
+    (picture,) = make_pictures(sphere, files, windowed)["pictures"]
 
     assert picture["window_mm_water"] == [0.0, pytest.approx(twice_the_most_mm)]
     middle_grey = (127, 128)
@@ -491,8 +494,9 @@ def test_slices_in_space_are_seen_obliquely_by_default_without_a_warning(
 
     report = make_pictures(sphere, PictureFiles(tmp_path / "a.png"), settings)
 
-    assert report["pictures"][0]["view"] == "30,30"
-    assert report["pictures"][0]["hit_share"] > 0.1  # measured 0.106; seen edge-on it is 0
+    (picture,) = report["pictures"]
+    assert picture["view"] == "30,30"
+    assert picture["hit_share"] > 0.1  # measured 0.106; seen edge-on it is 0
     assert not any("edge-on" in text for text in report["warnings"])
 
 
@@ -517,7 +521,7 @@ def test_report_of_a_sheet_has_its_size_slices_and_colours_of_labels(
 
     report = make_pictures(sphere, PictureFiles(tmp_path / "a.png"), sheet_settings)
 
-    picture = report["pictures"][0]
+    (picture,) = report["pictures"]
     assert picture["size"] == [1600, 1200]
     assert len(picture["tiles"]) == 6
     assert picture["camera"] is None
@@ -532,7 +536,8 @@ def test_red_pixels_of_a_sheet_are_those_of_its_label(
     image = np.asarray(Image.open(tmp_path / "a.png").convert("RGB")).astype(int)
     is_red = (image[..., 0] - image[..., 1]) > 30
     in_label = np.load(tmp_path / "v.npy") > 100  # HU
-    assert is_red.sum() == pytest.approx(in_label.sum(), rel=0.15)  # voxels of the label against interpolated HU
+    # Voxels of the label against interpolated HU: measured 1.4 % more.
+    assert is_red.sum() == pytest.approx(in_label.sum(), rel=0.03)
 
 
 def test_depths_of_a_sheet_are_refused(sheet_settings: RenderSettings, sphere: Path, tmp_path: Path) -> None:
@@ -549,7 +554,8 @@ class DrawnMinimum:
 
     @property
     def left_out(self) -> dict[str, Any]:
-        return self.report["pictures"][0]["left_out"]
+        (picture,) = self.report["pictures"]
+        return picture["left_out"]
 
 
 @pytest.fixture(scope="module")
@@ -570,12 +576,10 @@ def draw_minimum(device: Any, tmp_path_factory: Any) -> Any:
 
 @pytest.mark.parametrize("has_region", [False, True], ids=["whole", "region"])
 def test_minimum_shows_tissue_and_leaves_out_the_air_about_it(has_region: bool, draw_minimum: Any) -> None:
-    drawn = draw_minimum(has_region)
+    drawn = draw_minimum(has_region=has_region)
 
     assert np.nanmin(drawn.values) > -300.0  # tissue; measured 748 on, and air has -1000
-    low, high = drawn.report["volume"]["hu_range"]
-    assert low < -900.0  # of the scan, which is read whole
-    assert high < 5000.0
+    assert drawn.report["volume"]["hu_range"] == [-1000.0, 1000.0]  # of the scan, which is read whole
     assert drawn.left_out["body"]
 
 
@@ -583,14 +587,14 @@ def test_minimum_shows_tissue_and_leaves_out_the_air_about_it(has_region: bool, 
 def test_minimum_reports_and_warns_that_what_is_outside_of_a_region_is_left_out(
     has_region: bool, draw_minimum: Any
 ) -> None:
-    drawn = draw_minimum(has_region)
+    drawn = draw_minimum(has_region=has_region)
 
     assert drawn.left_out["region"] == has_region
     assert any("is left out:" in text for text in drawn.report["warnings"]) == has_region
 
 
 def test_minimum_with_a_region_leaves_out_more_than_without(draw_minimum: Any) -> None:
-    whole, region = draw_minimum(False), draw_minimum(True)
+    whole, region = draw_minimum(has_region=False), draw_minimum(has_region=True)
 
     assert 0.5 < whole.left_out["share"] < region.left_out["share"] < 1.0  # measured 0.958 and 0.961
     assert np.isfinite(region.values).sum() > 20  # pixels that show the region

@@ -47,7 +47,7 @@ def test_kind_of_an_input_of_a_view_follows_from_its_file(files):
 def test_scan_and_label_map_of_a_view_lie_at_the_place_of_their_files(files):
     scan, labels = (opened.subject for opened in open_inputs([files / "scan.nii.gz", files / "labels.nii.gz"]))
     assert isinstance(scan, Volume) and isinstance(labels, LabelMap)
-    assert np.allclose(scan.affine, scenes.AFFINE, atol=1e-4)
+    assert np.allclose(scan.affine, scenes.AFFINE, atol=1e-4)  # mm; NIfTI has float32
     assert np.allclose(labels.affine, scenes.AFFINE, atol=1e-4)
     assert labels.numbers == (5,)
 
@@ -74,7 +74,9 @@ def test_input_of_a_view_in_ras_is_turned_to_lps_with_a_remark(files, in_lps, in
 
 
 def test_inputs_of_a_view_have_given_names_or_kind_and_number(files):
-    shown = wrap_inputs(open_inputs([files / "scan.nii.gz", files / "ras.ply", files / "labels.nii.gz"]), ["knee"])
+    shown = wrap_inputs(
+        open_inputs([files / "scan.nii.gz", files / "ras.ply", files / "labels.nii.gz"]), names=["knee"]
+    )
     assert [each.name for each in shown] == ["knee", "mesh 2", "labels 3"]
 
 

@@ -97,7 +97,7 @@ def test_a_face_that_is_there_twice_fails_its_gate():
     assert "duplicate_faces" in names_of_failed(gates)
 
 
-def compare_spheres(radius_mm: float) -> MeshDistance:
+def compare_spheres(*, radius_mm: float) -> MeshDistance:
     """A sphere against one of 10 mm about the same centre."""
     sphere, reference = (Mesh(*samples.sphere(radius=radius, rounds=4)) for radius in (radius_mm, 10.0))
     return compare_meshes(sphere, reference, samples=2000)
@@ -116,7 +116,7 @@ def compare_spheres(radius_mm: float) -> MeshDistance:
 )
 def test_deviation_fails_the_gates_whose_bounds_it_exceeds(radius_mm, failing):
     """0.5 % of volume; in voxels of 1 mm a mean of 0.1 mm, and 0.25 mm for 95 %."""
-    gates = judge_mesh(deviation=compare_spheres(radius_mm), voxel_mm=1.0)
+    gates = judge_mesh(deviation=compare_spheres(radius_mm=radius_mm), voxel_mm=1.0)
     assert {gate["name"] for gate in gates} == {"volume_change", "deviation_mean", "deviation_p95"}
     assert names_of_failed(gates) == failing
 
@@ -124,7 +124,7 @@ def test_deviation_fails_the_gates_whose_bounds_it_exceeds(radius_mm, failing):
 @pytest.mark.parametrize(("voxel_mm", "failing"), [(2.0, {"deviation_mean"}), (4.0, set())])
 def test_bounds_of_deviation_grow_with_the_voxel_and_an_open_surface_has_none_on_volume(voxel_mm, failing):
     """0.3 mm are 0.15 and 0.075 voxels."""
-    gates = judge_mesh(deviation=compare_spheres(10.3), voxel_mm=voxel_mm, closed=False)
+    gates = judge_mesh(deviation=compare_spheres(radius_mm=10.3), voxel_mm=voxel_mm, closed=False)
     assert names_of_failed(gates) == failing
 
 
@@ -248,4 +248,4 @@ def test_a_voxel_length_without_a_deviation_has_no_gate():
 
 
 def test_a_deviation_without_a_voxel_length_has_no_gate():
-    assert judge_mesh(deviation=compare_spheres(10.3)) == []
+    assert judge_mesh(deviation=compare_spheres(radius_mm=10.3)) == []

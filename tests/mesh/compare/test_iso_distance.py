@@ -318,7 +318,7 @@ def test_vertices_within_two_voxels_of_metal_are_left_out():
     vertices = np.array([*WITHIN_TWO_VOXELS_OF_METAL, *others], float)
     measured = measure_iso_distance(Mesh(vertices, [*TWO_TRIANGLES, [6, 7, 8]]), volume, rule)
     of_others = distances_to_iso_surface(volume, rule, np.array(others, float))
-    assert np.isfinite(of_others).sum() >= 2
+    assert np.isfinite(of_others).sum() == 4  # those at the edge of the bone
     assert measured["away_from_metal_voxel"]["max"] == np.nanmax(of_others)
 
 
@@ -361,7 +361,7 @@ def test_distances_are_of_the_area_and_not_of_the_number_of_points(at):
     measured = measure_iso_distance(mesh, volume, choose_iso_rule(volume, 3000.0, closed=False))
     of_surface = measured["surface_voxel"] if at == "surface_mm" else measured[at]  # voxels of 1 mm
     assert of_surface["mean"] == pytest.approx(0.2 * 0.4, rel=1e-3)  # the last step of a search is below 1e-3 mm
-    assert of_surface["p95"] == pytest.approx(0.4, rel=1e-3)
+    assert of_surface["p95"] == pytest.approx(0.4, rel=1e-3)  # the same
 
 
 BALL_RADIUS = 4.5

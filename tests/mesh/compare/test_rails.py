@@ -14,6 +14,7 @@ LAST = 40
 
 
 def make_volume(last: int = LAST, pixel_mm: float = 1.0) -> Volume:
+    """A scan of slices 0 to `last`, 2 mm apart."""
     affine = np.diag((pixel_mm, -pixel_mm, 2.0, 1.0))
     affine[:3, 3] = -40.0, 130.0, 700.0
     return Volume(np.zeros((last + 1, 4, 4), np.int16), affine)
@@ -67,7 +68,7 @@ def test_a_bar_is_a_rail_where_it_is_thin_and_straight_from_end_to_end(differenc
 
 @pytest.mark.parametrize(("last", "rail"), [(30, True), (29, False)], ids=["60 mm", "58 mm"])
 def test_a_scan_shorter_than_60_mm_shows_no_rail(last, rail):
-    volume = make_volume(last)
+    volume = make_volume(last=last)
     points = make_bar(volume)
     assert is_straight(points, volume) == rail
     assert is_rail(volume, points) == rail

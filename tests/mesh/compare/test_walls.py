@@ -122,8 +122,8 @@ def test_a_vessel_that_is_joined_to_bone_is_a_share_of_it_up_to_where_bone_is_ne
     walls = Walls(np.column_stack([x, np.zeros((501, 2))]), np.where(is_bone, 900.0, 350.0), ~is_bone)
     judged = judge_walls(walls)
     assert judged["looks_like"] == "bone"
-    assert judged["compact_share"] == pytest.approx(0.4, abs=0.01)
-    assert judged["contrast_share"] == pytest.approx(0.4, abs=0.05)
+    assert judged["compact_share"] == pytest.approx(40 / 100, abs=2 / 501)  # of 501 points, one at either end
+    assert judged["contrast_share"] == pytest.approx(1 - (40 + 20) / 100, abs=2 / 501)
 
 
 @pytest.fixture(scope="module")

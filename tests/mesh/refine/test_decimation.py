@@ -37,7 +37,7 @@ def noise_surface(seed: int, shape: tuple[int, int, int] = (12, 12, 12), closed:
     affine = np.diag([*SPACING_MM, 1.0])
     affine[:3, 3] = FAR
     vertices, _, triangles = extract_isosurface(Volume(voxels, affine), 120, closed=closed)
-    return Mesh(vertices, triangles, None, {"affine_ijk_to_lps_mm": affine.tolist()})
+    return Mesh(vertices, triangles, report={"affine_ijk_to_lps_mm": affine.tolist()})
 
 
 def points_of(mesh: Mesh) -> np.ndarray:
@@ -49,11 +49,13 @@ def points_of(mesh: Mesh) -> np.ndarray:
 
 
 def volumes_of(mesh: Mesh) -> np.ndarray:
+    """Volume in mm3 that each component encloses."""
     labelled = label_components(mesh.triangles, mesh.vertex_count, find_edges(mesh.triangles, mesh.vertex_count))
     return enclosed_mm3(mesh.vertices - FAR, mesh.triangles, *labelled)
 
 
 def check_within(mesh: Mesh, before: Mesh, bound: float) -> None:
+    """Assert that no point of either surface is further from the other than the bound, in mm."""
     limit = bound + tolerances.float32_unit(before.vertices)
     for one, other in ((mesh, before), (before, mesh)):
         assert SurfaceDistance(other.vertices, other.triangles)(points_of(one)).max() <= limit
@@ -61,7 +63,7 @@ def check_within(mesh: Mesh, before: Mesh, bound: float) -> None:
 
 def test_a_sphere_loses_nine_of_ten_triangles_within_the_bound():
     radius_mm, bound_mm = 20.0, 0.1
-    sphere = Mesh(*samples.sphere(FAR, radius=radius_mm, rounds=6), None, {"iso_value_hu": 300.0})
+    sphere = Mesh(*samples.sphere(FAR, radius=radius_mm, rounds=6), report={"iso_value_hu": 300.0})
     small = decimate_mesh(sphere, 0.9, bound_mm)
     assert small.triangle_count == pytest.approx(0.1 * sphere.triangle_count, abs=2)  # an edge takes two
     check_within(small, sphere, bound_mm)
@@ -151,7 +153,8 @@ def test_each_component_keeps_its_volume():
     check_within(small, mesh, bound_mm)
     for part, before in zip(split_components(small), split_components(mesh), strict=True):
         assert part.triangle_count < before.triangle_count
-        assert part.quality()["volume_ml"] == pytest.approx(before.quality()["volume_ml"], rel=1e-5)
+        volume_ml = before.quality()["volume_ml"]
+        assert part.quality()["volume_ml"] == pytest.approx(volume_ml, rel=1e-5)  # float32; measured 2.5e-6
 
 
 @pytest.mark.parametrize("fraction", [0.0, 1.0, -0.1, 90.0, float("nan")])
@@ -207,7 +210,7 @@ def test_each_speck_keeps_its_volume(seed):
     assert small.triangle_count < 0.7 * mesh.triangle_count  # measured 0.63 and 0.65: the bound ends it before 0.4
     before, after = (np.sort(volumes_of(each)) for each in (mesh, small))
     large = np.abs(before) > 0.1  # of smaller ones the rounding of coordinates is as large
-    assert np.abs(after / before - 1.0)[large].max() <= 5e-4
+    assert np.abs(after / before - 1.0)[large].max() <= 5e-4  # measured 1.2e-4
 
 
 def test_nothing_is_removed_where_the_bound_allows_nothing():

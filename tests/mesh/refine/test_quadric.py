@@ -21,7 +21,7 @@ FAR = np.array([-150.25, 1071.5, -846.0])
 
 
 def joined_mesh(*shapes: samples.Arrays) -> Mesh:
-    return Mesh(*samples.join(*shapes), None, {"iso_value_hu": 300.0})
+    return Mesh(*samples.join(*shapes), report={"iso_value_hu": 300.0})
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +62,10 @@ def test_the_largest_distance_of_a_collapsed_sphere_and_torus_is_reported(sphere
 
 @pytest.fixture(scope="module")
 def sphere_and_three_specks():
-    """A sphere of 10 mm, and three specks 30 mm from it: only their vertices say how far away a result without is."""
+    """A sphere of 10 mm, and three specks 30 mm from it: only their vertices say how far away a result without is.
+
+    Their centres lie 40 mm from that of the sphere along x, and up to 4 mm along y.
+    """
     specks = [samples.sphere((40.0, 4.0 * i, 0.0), radius=0.05, rounds=0) for i in range(3)]
     return joined_mesh(samples.sphere((0.0, 4.0, 0.0), radius=10.0, rounds=5), *specks)
 
@@ -75,7 +78,8 @@ def test_components_that_a_collapse_loses_are_counted_and_fail_their_gate_with_a
     assert small.report["warnings"] == [
         "components of 4 that collapsing edges by their quadric error has lost: 3, none allowed"
     ]
-    assert facts["farthest_mm"] == pytest.approx(30.0, abs=0.5)
+    from_speck_to_sphere_mm = np.hypot(40.0, 4.0) - 10.0
+    assert facts["farthest_mm"] == pytest.approx(from_speck_to_sphere_mm, abs=2 * 0.05)  # the radius of a speck
 
 
 def test_edges_that_a_collapse_opens_are_counted_and_fail_their_gate_with_a_warning(sphere_and_three_specks):

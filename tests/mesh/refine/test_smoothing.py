@@ -36,7 +36,7 @@ def noisy_sphere(noise: float, seed: int = 1) -> Mesh:
     """A sphere of 20 mm with noise of its radius, in mm."""
     vertices, triangles = samples.sphere((0, 0, 0), radius=1.0, rounds=5)
     lengths = RADIUS + np.random.default_rng(seed).normal(scale=noise, size=len(vertices))
-    return Mesh(CENTRE + vertices * lengths[:, None], triangles, None, {"iso_value_hu": 300.0})
+    return Mesh(CENTRE + vertices * lengths[:, None], triangles, report={"iso_value_hu": 300.0})
 
 
 def noisy_plane(noise: float, size: int = 30) -> Mesh:
@@ -50,6 +50,7 @@ def noisy_plane(noise: float, size: int = 30) -> Mesh:
 
 
 def radial_error(mesh: Mesh) -> np.ndarray:
+    """How far each vertex lies outside of the sphere, in mm."""
     return np.linalg.norm(mesh.vertices - CENTRE, axis=1) - RADIUS
 
 
@@ -58,6 +59,7 @@ NOISE_MM = 0.1
 
 @pytest.fixture(scope="module")
 def rough_sphere() -> Mesh:
+    """A sphere with noise of NOISE_MM of its radius."""
     return noisy_sphere(NOISE_MM)
 
 
@@ -227,7 +229,7 @@ def test_smoothing_a_mesh_without_an_affine_needs_a_bound():
 def test_the_default_bound_of_a_sheared_affine_is_a_quarter_of_its_shortest_column():
     """The columns are 0.5, 0.4 and 2 mm long, the rows 0.3, 0.57 and 2."""
     report = {"affine_ijk_to_lps_mm": [[0.3, 0, 0, 5], [0.4, 0.4, 0, 6], [0, 0, 2, 7], [0, 0, 0, 1]]}
-    assert default_deviation(Mesh(*samples.box(), None, report)) == 0.4 / 4
+    assert default_deviation(Mesh(*samples.box(), report=report)) == 0.4 / 4
 
 
 def test_only_vertices_at_a_fault_are_taken_back_by_half_a_step_at_first():
@@ -275,7 +277,7 @@ def test_vertices_that_stay_in_the_way_at_every_share_of_their_step_are_taken_ba
     """A corner that would go into a larger box by a whole, a half and a quarter step stays where it was."""
     vertices, triangles = samples.join(samples.box(), samples.box((1.25, -5, -5), size=(10, 10, 10)))
     step = np.zeros((16, 3))
-    step[7] = (4.0, 0.0, 0.0)
+    step[7] = (4.0, 0.0, 0.0)  # the corner (1, 1, 1), 0.25 mm from the larger box
     moved, taken_back = move_vertices(vertices.astype(np.float32), triangles.astype(np.uint32), step)
     np.testing.assert_array_equal(moved, vertices)
     assert taken_back > 0
@@ -353,7 +355,7 @@ def test_vertices_that_would_stop_in_the_way_back_of_others_are_taken_back_again
     step[: 16 * 8, 0] = 8.0
     moved, taken_back = move_vertices(vertices.astype(np.float32), triangles.astype(np.uint32), step)
     np.testing.assert_allclose(moved, vertices + 0.25 * step, atol=1e-6)
-    assert taken_back >= 16 * 8
+    assert taken_back >= 16 * 8  # the corners of the boxes
 
 
 def test_smoothing_tells_its_three_steps():
@@ -428,6 +430,7 @@ def filter_wave(turns: int, iterations: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def measure_gain(turns: int, iterations: int) -> float:
+    """The amplitude of such a wave after the filter, as a share of that before."""
     wave, filtered = filter_wave(turns, iterations)
     return float(filtered @ wave) / float(wave @ wave)
 
@@ -461,6 +464,7 @@ def test_the_filter_damps_the_shortest_wave_and_removes_it_from_20_iterations_on
 
 @pytest.fixture
 def sphere_triangles():
+    """The number of vertices of a sphere, and its triangles."""
     vertices, triangles = samples.sphere((0, 0, 0), radius=1.0, rounds=3)
     return len(vertices), triangles.astype(np.uint32)
 
