@@ -47,7 +47,7 @@ def test_the_spacing_far_from_the_origin_is_the_same(ball: np.ndarray) -> None:
 
 def test_a_point_2_m_away_changes_the_spacing_by_less_than_a_factor_of_two(ball: np.ndarray) -> None:
     with_outlier = np.concatenate([ball, [(2000.0, 2000.0, 2000.0)]])
-    assert 0.5 * BALL_SPACING < mean_spacing(with_outlier) < 2.0 * BALL_SPACING
+    assert 0.5 * BALL_SPACING < mean_spacing(with_outlier) < 2.0 * BALL_SPACING  # measured 0.85 of it
 
 
 @pytest.mark.parametrize(

@@ -309,7 +309,7 @@ def test_thin_walls_alone_are_taken_for_thicker_and_less_dense_ones(device):
     mesh, fit = fit_surface(hollow_ball(thickness=0.8), device)
     assert fit.constants.cortex_hu < 800.0  # measured 566
     away, _ = outer_places(mesh, fit)
-    assert 0.1 < np.mean(away) < 0.35  # mm outside of the bone
+    assert 0.1 < np.mean(away) < 0.35  # mm outside of the bone; measured 0.31
 
 
 def test_sheets_of_a_couch_around_a_shell_leave_the_constants_of_its_bone(device):
@@ -364,7 +364,7 @@ def test_the_less_dense_of_two_bones_is_found_nearer_to_the_truth_by_its_own_cor
         places = mesh.vertices + fit.shift_mm[:, None] * mesh.normals
         return np.abs(np.linalg.norm(places[outer] - middle, axis=1) - OUTER_RADIUS).mean()
 
-    assert mean_distance(components=is_second) < 0.06 < mean_distance(components=None)  # mm; 0.19 for None
+    assert mean_distance(components=is_second) < 0.06 < mean_distance(components=None)  # mm; measured 0.02 and 0.19
 
 
 def test_a_scan_without_bone_is_refused(device):

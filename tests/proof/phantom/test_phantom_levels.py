@@ -182,7 +182,7 @@ def test_written_label_of_a_vertebra_covers_voxels_of_bone(oblique_spine: tuple[
     medians = [np.median(voxels[labels == level["label"]]) for level in truth["spine"]["vertebrae"]]
 
     assert len(medians) == 4
-    assert min(medians) > 250.0  # HU; muscle has 54
+    assert min(medians) > 250.0  # HU; measured 299; muscle has 54
 
 
 @pytest.mark.release
@@ -338,7 +338,7 @@ def test_vertebrae_of_a_bent_spine_keep_their_sizes_and_orthonormal_axes() -> No
 @pytest.mark.release
 def test_vertebrae_at_the_apex_of_a_bent_spine_do_not_touch() -> None:
     bent = plan_vertebrae("T1-L5", kyphosis_deg=20.0, scoliosis_deg=-35.0)
-    assert min(distances_of_neighbours(bent[5:8])) > 1.5  # T6 to T8, where it bends most; mm
+    assert min(distances_of_neighbours(bent[5:8])) > 1.5  # T6 to T8, where it bends most; mm; measured 3.3
 
 
 @pytest.fixture(scope="module")
@@ -357,5 +357,5 @@ def test_scoliosis_moves_vertebrae_as_far_to_the_left_as_to_the_right(moves_of_b
 
 def test_kyphosis_moves_vertebrae_forwards_and_none_backwards(moves_of_bent_spine: np.ndarray) -> None:
     backwards_mm = moves_of_bent_spine[:, 1]
-    assert backwards_mm.min() < -5.0  # 30 degrees over some 430 mm bend by tens of mm
+    assert backwards_mm.min() < -20.0  # measured -36.7: 30 degrees over some 430 mm
     assert backwards_mm.max() == pytest.approx(0.0, abs=tolerances.DECIMAL_PLACE_MM)

@@ -49,7 +49,9 @@ def test_shares_of_voxels_are_float32_from_0_to_1_with_parts_at_the_surface(
     _, share = sampled_body
     assert share.dtype == np.float32
     assert (share.min(), share.max()) == (0.0, 1.0)
-    assert ((share > 0.0) & (share < 1.0)).sum() > 1000  # voxels at the surface of bodies of some 10 voxels
+    assert (
+        (share > 0.0) & (share < 1.0)
+    ).sum() > 1000  # at the surface of bodies of some 10 voxels; measured 1498 to 2734
 
 
 def test_body_within_the_grid_has_no_share_of_the_outermost_voxels(sampled_body: tuple[Any, np.ndarray]) -> None:
@@ -130,7 +132,7 @@ def test_half_share_surface_of_a_body_has_its_area_and_volume_and_lies_on_it(bod
     assert area_mm2 == pytest.approx(body.area_mm2, rel=2.5 * tolerances.PHANTOM_MESH_AREA_RATIO)  # edges, a torus
     assert volume_mm3 / 1000.0 == pytest.approx(body.volume_ml, rel=tolerances.PHANTOM_MESH_VOLUME_RATIO)
     rms_distance_mm = np.sqrt((body.signed_distance(corners) ** 2).mean())
-    assert rms_distance_mm < 0.1  # a sixth of a pixel
+    assert rms_distance_mm < 0.06  # a tenth of a pixel; measured 0.034
 
 
 def draw_noise_volume() -> tuple[np.ndarray, np.ndarray]:

@@ -86,7 +86,7 @@ def test_dry_skull_is_the_bone_of_a_head_without_its_soft_tissue() -> None:
     skull, head = truth_of_skull["parts"], truth_of_head["parts"]
     assert skull["bone"]["voxels"] == head["bone"]["voxels"]
     assert "tissue" not in skull
-    assert head["tissue"]["volume_ml"] > 1500.0  # a head has some 4000 ml
+    assert head["tissue"]["volume_ml"] > 1500.0  # measured 2464
 
 
 @pytest.mark.release
@@ -136,7 +136,7 @@ def test_prone_head_has_the_same_values_at_the_same_places_in_a_turned_image() -
 
     _, affine_of_prone, _ = prone
     assert np.sign(np.diag(affine_of_prone)[:3]).tolist() == [-1.0, -1.0, 1.0]
-    assert np.corrcoef(values)[0, 1] > 0.9  # nearest voxels of two grids
+    assert np.corrcoef(values)[0, 1] > 0.999  # measured 1
 
 
 def test_header_of_a_prone_scan_has_its_position_and_rows_and_columns_turned(tmp_path: Path) -> None:

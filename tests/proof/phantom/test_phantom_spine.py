@@ -54,8 +54,8 @@ def test_histogram_of_a_spine_peaks_at_the_value_of_a_tissue(
 @pytest.mark.release
 def test_one_to_six_percent_of_the_voxels_of_a_spine_are_bone_some_above_1000_hu(spine: tuple) -> None:
     voxels, _, _ = spine
-    assert 0.01 < (voxels > 226).mean() < 0.06  # HU of the default preset of bone
-    assert (voxels > 500).sum() > 5000  # of 1.9 million: cortex
+    assert 0.01 < (voxels > 226).mean() < 0.06  # HU of the default preset of bone; measured 0.018
+    assert (voxels > 500).sum() > 5000  # of 1.9 million: cortex; measured 14,369
     assert voxels.max() > 1000  # measured 2213: the marker
 
 
@@ -92,13 +92,13 @@ def test_vertebral_bodies_have_the_values_of_trabecular_bone_inside(spine: tuple
     front = centres_in_view(spine) - (0.0, 6.0, 0.0)  # away from the canal
     offsets = np.random.default_rng(1).uniform(-4.0, 4.0, (60, 3))
     points = (front + offsets[:, None]).reshape(-1, 3)
-    assert 150.0 < values_at(spine, points).mean() < 240.0  # HU
+    assert 150.0 < values_at(spine, points).mean() < 240.0  # HU; measured 188
 
 
 def test_half_way_between_vertebral_bodies_is_a_disc(spine: tuple) -> None:
     centres = centres_in_view(spine)
     half_way = (centres[1:] + centres[:-1]) / 2.0 - (0.0, 4.0, 0.0)
-    assert 70.0 < values_at(spine, half_way).mean() < 130.0  # HU
+    assert 70.0 < values_at(spine, half_way).mean() < 130.0  # HU; measured 91
 
 
 def centre_of_t12(spine: tuple) -> np.ndarray:
@@ -113,7 +113,7 @@ def test_left_marker_lies_on_the_left_alone(spine: tuple) -> None:
     mirrored = marker * (-1, 1, 1) + (2.0 * middle_x, 0, 0)
 
     assert truth["spine"]["left_marker_inside"]
-    assert marker[0] > centre_of_t12(spine)[0] + 50.0  # x grows to the left
+    assert marker[0] > centre_of_t12(spine)[0] + 50.0  # x grows to the left; measured 109 mm away
     assert values_at(spine, marker[None])[0] > 1200  # measured 2181
     assert values_at(spine, mirrored[None])[0] < 200  # neither metal nor bone; measured -112, as fat has
 
@@ -130,8 +130,8 @@ def test_twelfth_rib_is_on_the_right_alone(spine: tuple) -> None:
     on_the_right = ((to_the_left < -35.0) & (to_the_left > -60.0)).sum()
 
     assert truth["spine"]["absent"] == ["left rib 12"]
-    assert on_the_right > 60  # voxels
-    assert on_the_left < on_the_right / 3  # a little of the 11th rib
+    assert on_the_right > 200  # voxels; measured 393
+    assert on_the_left < on_the_right / 3  # a little of the 11th rib; measured 38
 
 
 @pytest.mark.release
@@ -145,7 +145,7 @@ def test_spine_has_the_same_anatomy_in_tilted_and_oblique_slices() -> None:
     pair = np.stack([values_at(made, centre_lps_mm + offsets) for made in (straight, turned)]).astype(float)
 
     # the nearest voxels of two grids differ at edges
-    assert np.corrcoef(pair)[0, 1] > 0.85
+    assert np.corrcoef(pair)[0, 1] > 0.93  # measured 0.965
     assert np.median(np.abs(pair[0] - pair[1])) < 25.0  # HU; measured 0
 
 
@@ -157,7 +157,7 @@ def test_voxels_between_muscle_and_cortex_have_many_values_of_partial_volume() -
     between = np.unique(around_the_body[(around_the_body > 240) & (around_the_body < 840)])
 
     # a thresholded drawing has few values at the rims; partial volume has all between muscle and cortex
-    assert len(between) > 60
+    assert len(between) > 60  # measured 120
 
 
 @pytest.mark.parametrize("name", ["T6", "L3"])

@@ -59,7 +59,9 @@ def linear_volume(steps):
 def test_gradient_of_a_linear_field_is_its_slope_within_the_volume(steps):
     volume = linear_volume(steps)
     gradients = voxel_gradients(volume.voxels, slice_normal_matrices(volume, 0))
-    assert np.abs(gradients[1:-1, 1:-1, 1:-1] - SLOPE).max() <= 1e-4  # HU per mm: float32 values of some 50 HU
+    assert (
+        np.abs(gradients[1:-1, 1:-1, 1:-1] - SLOPE).max() <= 5e-6
+    )  # HU per mm: float32 values of some 50 HU; measured 2e-6
 
 
 @pytest.mark.parametrize("steps", [*STEPS, "uneven"])
@@ -106,7 +108,7 @@ def test_interval_of_a_ray_reaches_half_a_voxel_beyond_the_outermost_voxels(step
 def test_interval_of_a_ray_through_uneven_slices_is_that_of_the_smallest_box_around_them():
     among_voxels, in_interval = compare_intervals(uneven_volume(lambda p: p[:, 0], shape=(20, 18), noise=0.0))
     assert in_interval[among_voxels].all()
-    assert among_voxels.sum() > 0.3 * in_interval.sum()  # slices that lean fill about half of their box
+    assert among_voxels.sum() > 0.3 * in_interval.sum()  # slices that lean fill about half of their box; measured 0.46
 
 
 @pytest.fixture(scope="module")
@@ -144,7 +146,9 @@ def test_values_of_a_transfer_function_are_those_of_the_nearest_node_of_its_tabl
     width = 4000 / last  # between two nodes, HU
     hu = np.array([-2000.0, -1000.0, -1000 + 0.4 * width, -1000 + 1.7 * width, 3000 - 0.6 * width, 3000.0, 9000.0])
     nodes = look_up(ramp, hu)[:, 3] / 0.8 * last
-    assert np.abs(nodes - (0.0, 0.0, 0.0, 2.0, last - 1.0, last, last)).max() < 1e-3  # of a node, in float32
+    assert (
+        np.abs(nodes - (0.0, 0.0, 0.0, 2.0, last - 1.0, last, last)).max() < 2e-4
+    )  # of a node, in float32; measured 6e-5
 
 
 @pytest.mark.parametrize(
@@ -225,7 +229,7 @@ def test_colour_opacity_and_depths_of_a_ray_are_the_sums_over_its_samples_writte
         weighted += weight * t
         depth = t if np.isnan(depth) and opacity > 1 / 255 else depth
         start += step
-    assert 0.3 < opacity < 0.99  # the ray sees bodies and does not end in one
+    assert 0.3 < opacity < 0.99  # the ray sees bodies and does not end in one; measured 0.61
     assert np.allclose(picture.rgba[row, column], [*colour, opacity])
     assert np.isclose(picture.depth[row, column], depth)
     assert np.isclose(picture.expected_depth[row, column], weighted / opacity)
