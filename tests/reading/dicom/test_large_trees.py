@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from dicom_series import write_series
+from dicom_series import element_bytes, insert_after, set_values, write_series
 from refusals import refused
 from tolerances import HEADER_BYTES, SCAN_PEAK_BYTES_A_FILE
 from variants import FOR_RELEASE
@@ -86,9 +86,12 @@ def test_each_header_of_a_large_tree_is_read_once_from_its_start_in_little_memor
 
 
 def test_headers_of_one_series_share_the_objects_of_what_they_have_in_common(tmp_path: Path) -> None:
-    write_series(tmp_path)
+    write_series(tmp_path, change=set_values(AcquisitionNumber=1))
+    for file in tmp_path.iterdir():
+        insert_after(file, "Modality", element_bytes("Modality", b"CT"))  # twice, which is warned of
     first, second, *_ = scan_path(tmp_path).slices
     for name in ("series", "phase", "row_cosines", "patient_hash", "frame_of_reference", "transfer_syntax", "warnings"):
+        assert getattr(first, name), name  # not an empty one, which all have in common
         assert getattr(first, name) is getattr(second, name), name
     assert not hasattr(first, "__dict__")  # slots
 

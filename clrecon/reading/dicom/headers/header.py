@@ -51,6 +51,7 @@ _RESCALE_INTERCEPT_LIMIT = 1e9
 
 # The slices of a series share equal values, so that a tree of 100,000 files needs little memory.
 _share_identity = lru_cache(1024)(SeriesIdentity)
+_share_texts = lru_cache(1024)(lambda *texts: texts)
 
 
 @lru_cache(256)
@@ -99,7 +100,7 @@ def read_headers(
         places = multiframe.find_places(values, sop_class, frames) if frames > 1 else None
         header = _validate(values, series, path, name, frames=frames)
         remarks = check_surplus(elements, header, force=force)
-        header = replace(header, warnings=(*header.warnings, *remarks)) if remarks else header
+        header = replace(header, warnings=_share_texts(*header.warnings, *remarks)) if remarks else header
         return [header] if places is None else list(multiframe.spread_frames(header, places))
     except ValueProblem as problem:
         return OtherImage(series, path, name, 1, "broken", f"{name}: {problem}")
@@ -128,7 +129,7 @@ def _read_frames(
                     frame=number,
                     concatenation=groups.concatenation,
                     phase=(*frame.phase, *header.phase),
-                    warnings=(*header.warnings, *remarks, *groups.warnings, *frame.warnings),
+                    warnings=_share_texts(*header.warnings, *remarks, *groups.warnings, *frame.warnings),
                 )
             )
     except ValueProblem as problem:
@@ -217,7 +218,7 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, 
         pixel_length=elements.pixel_length,
         inflate_from=elements.inflate_from,
         file_bytes=elements.file_bytes,
-        warnings=tuple(warnings),
+        warnings=_share_texts(*warnings),
         patient_position=lay if (lay := values.text("PatientPosition").upper()) in PATIENT_POSITIONS else "",
         quadruped=values.text("AnatomicalOrientationType").strip().upper() == "QUADRUPED",
         derived=tuple(derived),
