@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import sys
 from collections.abc import Container, Iterable, Iterator, Mapping
 from functools import cache
@@ -10,6 +11,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "clrecon"
+ABSOLUTE_PATH = re.compile(r"""(?:^|[\s"'=:(])(/\w[\w.-]*/[\w./-]*|[A-Z]:\\)""")
+"""The path of a file or folder of some machine, in a text."""
 
 LEFT_OF: dict[str, frozenset[str]] = {}
 """For each layer (a module or folder of clrecon/) the layers that it may import."""

@@ -128,10 +128,13 @@ def test_warning_of_a_phase_tells_how_many_slices_of_others_are_left_out(report_
     assert expected in report_of_phase_2["warnings"]
 
 
-@TWO_PHASES
-def test_warnings_of_a_phase_hold_no_date_of_its_slices(report_of_phase_2, keyword, values):
-    assert report_of_phase_2["warnings"]
-    assert not any("2020" in warning or "2021" in warning for warning in report_of_phase_2["warnings"])
+@pytest.mark.parametrize(
+    ("first", "second"), [({"AcquisitionDate": "20200101"}, {"AcquisitionDate": "20210704"})], ids=["of 2020 and 2021"]
+)
+def test_warnings_of_phases_that_their_dates_tell_apart_hold_no_date(report_of_phase_2):
+    warnings = "; ".join(report_of_phase_2["warnings"])
+    assert "AcquisitionDate date 2" in warnings
+    assert "2020" not in warnings and "2021" not in warnings
 
 
 def test_phases_of_different_lengths_are_listed_and_read(tmp_path):
