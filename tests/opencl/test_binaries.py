@@ -12,7 +12,6 @@ from clrecon.errors import DeviceError
 from clrecon.opencl import cache, program, quirks
 from clrecon.opencl.cache import binary_key, make_private, prepare_caches, read_binary, store_binary
 from clrecon.opencl.program import load_program
-from clrecon.opencl.sources import read_kernel_source
 
 KEY = binary_key("device", "source")
 
@@ -144,12 +143,15 @@ def test_loaded_binary_computes_what_its_source_does(keeping_pocl, monkeypatch):
         assert compact(keeping_pocl, upload(keeping_pocl, mask), len(mask)).count == set_bits
 
 
-def test_program_whose_binary_the_driver_refuses_is_built_from_source(keeping_pocl, monkeypatch):
-    no_options = ()
-    key = program._key(keeping_pocl, read_kernel_source("primitives/compact.cl"), no_options)
+def test_program_whose_binary_the_driver_refuses_is_built_from_source_and_its_binary_replaced(
+    keeping_pocl, own_cache, monkeypatch
+):
+    load_program(keeping_pocl, "primitives/compact.cl")
+    [key] = (path.name for path in own_cache.iterdir())
     store_binary(key, b"no program at all")
     forget_programs(keeping_pocl, monkeypatch)
     assert load_program(keeping_pocl, "primitives/compact.cl").kernel_names == ["count_set_bits", "list_set_bits"]
+    assert read_binary(key) not in (None, b"no program at all")
 
 
 def test_program_without_kernels_is_refused_with_its_file(keeping_pocl, monkeypatch):

@@ -58,7 +58,9 @@ def test_report_of_a_reconstruction_names_its_lengths(sphere_mesh):
 
 def test_report_of_a_reconstruction_counts_points_regions_slabs_and_votes(sphere_mesh):
     report = sphere_mesh.report
-    assert (report["points"], report["regions"], report["slabs"], report["tries"]) == (12_000, 2, 1, 1)
+    inside_and_outside = 2
+    assert (report["points"], report["regions"]) == (12_000, inside_and_outside)
+    assert (report["slabs"], report["tries"]) == (1, 1)
     assert report["votes_against_share"] < 0.005  # measured 0
 
 
