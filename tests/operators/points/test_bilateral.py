@@ -142,7 +142,7 @@ def test_shifted_cloud_is_filtered_alike_except_for_rounding(device):
     near = denoise_points(PointCloud(points), device=device).cloud.points
     far = denoise_points(PointCloud(points + shift), device=device).cloud.points
     assert far.dtype == np.float64
-    assert np.abs(far - shift - near).max() < 1e-4  # float32 relative to the cloud's middle; measured 8e-7
+    assert np.abs(far - shift - near).max() < 2e-6  # float32 relative to the cloud's middle; measured 8e-7
 
 
 def test_permuted_points_give_permuted_results(device):

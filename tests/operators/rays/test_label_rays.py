@@ -120,6 +120,7 @@ def test_translucent_label_is_translucent_where_nothing_is_behind(balls_side_by_
 def test_labels_without_colours_keep_the_colour_of_the_picture(balls_side_by_side):
     found, _ = balls_side_by_side
     seen = found.image[found.image[..., 3] > 0]
+    assert len(seen) > 100  # pixels of the balls
     assert (seen[:, :3] == 255).all()
 
 

@@ -236,4 +236,6 @@ def test_pictures_of_any_size_have_all_their_pixels(device, size):
     )
     assert found.image.shape == (size[1], size[0], 4)
     assert expected.image[..., 3].max() > 100  # of 255: something is shown; measured 249 on
-    assert np.abs(found.image[..., 3].astype(int) - expected.image[..., 3]).max() <= 2  # of 255; measured 0
+    assert (
+        np.abs(found.image[..., 3].astype(int) - expected.image[..., 3]).max() <= tolerances.RAY_SAME_255
+    )  # measured 0

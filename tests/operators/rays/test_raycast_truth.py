@@ -336,7 +336,7 @@ def test_the_same_slices_at_even_places_show_no_round_ball(cast, uneven_ball):
     shot = cast(nominal, "dvr", BONE, camera=camera, size=size, ray_step=0.2)
     passing, _, off_outline = off_its_outline(uneven_ball, camera, size)
     is_wrong = np.isfinite(shot.depth) != (passing < UNEVEN_RADIUS)
-    assert is_wrong[off_outline].sum() > 20  # pixels; measured 193
+    assert is_wrong[off_outline].sum() > 100  # pixels; measured 193
 
 
 @pytest.mark.release
