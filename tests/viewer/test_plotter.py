@@ -144,7 +144,7 @@ def test_key_t_fits_the_scan_to_its_bone_and_back(scene):
     fitted = np.array(actor.mapper.dataset.points)
     scene.keys["t"]()
 
-    assert np.linalg.norm(fitted - at_level, axis=1).mean() > 0.05  # mm
+    assert np.linalg.norm(fitted - at_level, axis=1).mean() > 0.15  # mm; measured 0.31
     np.testing.assert_array_equal(actor.mapper.dataset.points, at_level)
 
 

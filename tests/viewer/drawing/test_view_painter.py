@@ -41,10 +41,10 @@ def test_each_mode_is_drawn_sharp_and_coarse(open_model_and_painter):
         model.set_mode(mode)
         sharp = painter.picture(model.state, SIZE)
         coarse = painter.picture(model.state, SIZE, sharp=False, share=0.5)
-        assert sharp.size == SIZE and shown_pixels(sharp) > 100, mode  # of 7,680; the fewest, of slices, were 1,147
+        assert sharp.size == SIZE and shown_pixels(sharp) > 600, mode  # of 7,680; the fewest, of slices, were 1,147
         assert sharp.report["sharp"] and sharp.report["ms"] > 0.0
         assert coarse.size == (77, 64) and not coarse.report["sharp"], mode  # the shorter side has 64 pixels at least
-        assert shown_pixels(coarse) > 50
+        assert shown_pixels(coarse) > 350  # of 4,928; the fewest were 732
 
 
 def test_picture_of_a_surface_in_a_view_is_that_of_render(open_model_and_painter, device):
@@ -253,7 +253,7 @@ def test_slice_of_a_mesh_alone_is_empty(open_model_and_painter):
 def test_slice_of_labels_alone_is_coloured(open_model_and_painter):
     model, painter = open_model_and_painter(scenes.make_labels())
     picture = painter.slice(model.state, "axial", SIZE)
-    assert np.ptp(picture.image[..., :3].astype(int), axis=2).max() > 20  # of 255, between the channels
+    assert np.ptp(picture.image[..., :3].astype(int), axis=2).max() > 75  # of 255, between the channels; measured 153
 
 
 def test_whole_scan_is_translucent_before_its_parts_are_known(open_model_and_painter):

@@ -148,7 +148,7 @@ def test_colours_of_a_fitted_surface_go_from_thickness_to_error_to_none_each_wit
     lightest_yellow = [255, 255, 178]  # of the scale YlOrRd
     assert len(scale["colors"]) > 32 and scale["colors"][0] == lightest_yellow  # 64 steps
     for moving in (True, False):
-        assert np.abs(picture(view, moving=moving).image[..., :3].astype(int)).max() > 100  # of 255: something is shown
+        assert np.abs(picture(view, moving=moving).image[..., :3].astype(int)).max() > 200  # of 255: something is shown
     assert np.abs(picture(view).image.astype(int) - plain).max() > 50  # of 255: in other colours; measured 151
     assert do(view, "step_color_by")["scale"]["title"] == "mm of error"
     assert do(view, "step_color_by")["color_by"] is None
@@ -159,14 +159,14 @@ def test_parts_of_a_fitted_surface_are_hidden_picked_and_translucent(open_sessio
     do(view, "set_fitted", shown=True)
     both, one_key = shown_pixels(picture(view)), "1/1"
     do(view, "show", key=one_key, visible=False)
-    assert 0.4 * both < shown_pixels(picture(view)) < 0.6 * both  # one of two equal balls
+    assert shown_pixels(picture(view)) == pytest.approx(0.5 * both, rel=0.05)  # one of two equal balls
     do(view, "show", key=one_key, visible=True)
     x, y = view.model.camera.project([MIDDLE + [0.0, 0.0, 40.0]], SIZE)[0][0]
     upper = view.do({"do": "pick", "x": float(x), "y": float(y), "size": list(SIZE)})["pick"]["part"]
     assert upper in ("1/1", "1/2") and view.model.state.part(upper).kind == "cluster"
     do(view, "set_opacity", key=upper, value=0.3)
     image = picture(view).image
-    assert image[round(y), round(x), 3] == pytest.approx(255 * (1.0 - 0.7**4), abs=40)  # of two walls with two faces
+    assert image[round(y), round(x), 3] == pytest.approx(255 * (1.0 - 0.7**4), abs=3)  # of two walls with two faces
 
 
 def test_what_is_saved_is_the_fitted_surface_with_its_numbers_and_scale(open_session, tmp_path: Path) -> None:
@@ -181,12 +181,12 @@ def test_what_is_saved_is_the_fitted_surface_with_its_numbers_and_scale(open_ses
     radii = np.linalg.norm(mesh.vertices - MIDDLE, axis=1)
     is_outer = radii > RADIUS_MM - 0.5 * THICKNESS_MM
     assert np.median(radii[is_outer]) == pytest.approx(RADIUS_MM, abs=0.1)
-    assert np.nanmedian(mesh.values["thickness_mm"][is_outer]) == pytest.approx(THICKNESS_MM, abs=0.3)
+    assert np.nanmedian(mesh.values["thickness_mm"][is_outer]) == pytest.approx(THICKNESS_MM, abs=0.15)  # measured 2.93
     with Image.open(tmp_path / "a.png") as written:
         assert written.size[0] > width + 30 and written.size[1] == height  # the scale on its right
     do(view, "add_clip", direction="left")
     view.save(tmp_path / "b.ply")
     assert view.wait(PATIENCE)
     half = read_mesh(tmp_path / "b.ply")
-    assert half.triangle_count < 0.6 * mesh.triangle_count  # the clip goes through the middle
+    assert half.triangle_count < 0.6 * mesh.triangle_count  # the clip goes through the middle; measured 0.54
     assert "error_mm" in half.values
