@@ -218,7 +218,8 @@ def test_traits_have_their_weights(trait: str, weight: float) -> None:
 
 def test_a_vertebra_that_lacks_every_trait_has_a_confidence_of_a_40th() -> None:
     nothing = {name: (0.0, name) for name in WEIGHTS}
-    assert weigh(nothing)[0] == pytest.approx(math.exp(-3.67))  # the sum of all weights
+    confidence, _ = weigh(nothing)
+    assert confidence == pytest.approx(math.exp(-3.67))  # the sum of all weights
 
 
 def test_traits_that_take_a_fifth_of_what_the_worst_takes_are_named_as_doubts() -> None:

@@ -38,9 +38,15 @@ def phantom(levels: str, **choice: Any) -> tuple[Volume, np.ndarray, dict[int, s
     return volume, numbers, {n: name for n, name in truth.names.items() if (numbers == n).any()}
 
 
+def scan_of(levels: str, **choice: Any) -> Volume:
+    """The scan of a phantom alone."""
+    volume, _, _ = phantom(levels, **choice)
+    return volume
+
+
 @cache
 def split(levels: str, **choice: Any) -> clrecon.VertebraSplit:
-    return clrecon.split_vertebrae(phantom(levels, **choice)[0], keep_unsure=True)
+    return clrecon.split_vertebrae(scan_of(levels, **choice), keep_unsure=True)
 
 
 def match_levels(labels: np.ndarray, truth: np.ndarray, names: dict[int, str]) -> dict[str, tuple[int, float]]:
@@ -130,7 +136,7 @@ NAMES_BY_NUMBER = {19: "T12", 20: "L1", 21: "L2", 22: "L3"}
 def named_at_a_centre() -> clrecon.VertebraSplit:
     """T12 to L3, of which the centre of the second is named L1."""
     centre = split("T12-L3").vertebrae[1].centre_mm
-    return clrecon.split_vertebrae(phantom("T12-L3")[0], name_at=(centre, "l1"))
+    return clrecon.split_vertebrae(scan_of("T12-L3"), name_at=(centre, "l1"))
 
 
 @pytest.mark.release
@@ -159,7 +165,7 @@ def test_a_named_point_in_the_canal_names_the_vertebra_around_it() -> None:
 
 @pytest.mark.release
 def test_the_level_of_the_uppermost_vertebra_names_all() -> None:
-    named = clrecon.split_vertebrae(phantom("T12-L3")[0], first="t12")
+    named = clrecon.split_vertebrae(scan_of("T12-L3"), first="t12")
     assert named.labels.names == NAMES_BY_NUMBER
     assert [vertebra.name for vertebra in named.vertebrae] == list(NAMES_BY_NUMBER.values())
 
@@ -197,7 +203,7 @@ def test_levels_seeds_and_thresholds_that_cannot_be_are_refused(choice: dict[str
     if choice.get("name_at", ("",))[0] == AT_THE_SECOND:
         choice = {"name_at": (split("T12-L3").vertebrae[1].centre_mm, choice["name_at"][1])}
     with pytest.raises(UsageError, match=words):
-        clrecon.split_vertebrae(phantom("T12-L3")[0], **choice)
+        clrecon.split_vertebrae(scan_of("T12-L3"), **choice)
 
 
 def split_by_seeds() -> dict[str, tuple[int, float]]:
@@ -234,7 +240,7 @@ def test_seeds_need_no_canal() -> None:
 @pytest.mark.usefixtures("no_canal_is_found")
 def test_a_scan_whose_canal_is_not_found_is_refused_without_seeds() -> None:
     with refused(RefusedInputError, "vertebrae"):
-        clrecon.split_vertebrae(phantom("T12-L3")[0])
+        clrecon.split_vertebrae(scan_of("T12-L3"))
 
 
 @pytest.fixture(scope="module")
@@ -396,7 +402,7 @@ def test_the_refusal_of_a_scan_without_a_vertebra_lists_what_was_left_out(left_o
 @pytest.mark.seconds
 def test_a_scan_of_c1_and_l5_alone_is_refused() -> None:
     with pytest.raises(RefusedInputError, match="no spine|disc|none of the"):
-        clrecon.split_vertebrae(phantom("C1,L5")[0])
+        clrecon.split_vertebrae(scan_of("C1,L5"))
 
 
 @pytest.mark.parametrize("kind", ["head", "limb", "empty", "water"])

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from sample_meshes import ball
+import sample_meshes as samples
 
 from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
@@ -14,15 +14,24 @@ from clrecon.points import PointCloud
 
 AFFINE = np.array([[0.9, 0.08, 0.0, -60.0], [-0.08, 0.9, 0.1, -40.0], [0.0, -0.1, 1.4, 200.0], [0, 0, 0, 1.0]])
 SHAPE = (22, 40, 44)
-BALLS = (((13.0, 20.0, 11.0), 9.0), ((33.0, 14.0, 9.0), 5.0), ((34.0, 31.0, 14.0), 3.0))
-"""Middle (i, j, k) and radius in mm of each, the largest first."""
+
+
+class Ball(NamedTuple):
+    """A ball of bone in the scan."""
+
+    middle_ijk: tuple[float, float, float]
+    radius_mm: float
+
+
+BALLS = (Ball((13.0, 20.0, 11.0), 9.0), Ball((33.0, 14.0, 9.0), 5.0), Ball((34.0, 31.0, 14.0), 3.0))
+"""The largest first."""
 
 ISO = 300.0
 
 
 def middle(number: int) -> np.ndarray:
     """Middle of a ball in LPS mm."""
-    return AFFINE[:3, :3] @ np.array(BALLS[number][0]) + AFFINE[:3, 3]
+    return AFFINE[:3, :3] @ np.array(BALLS[number].middle_ijk) + AFFINE[:3, 3]
 
 
 def make_scan(*, affine: np.ndarray = AFFINE, dtype: Any = np.int16, scale: float = 1.0) -> Volume:
@@ -30,15 +39,15 @@ def make_scan(*, affine: np.ndarray = AFFINE, dtype: Any = np.int16, scale: floa
     k, j, i = np.indices(SHAPE, dtype=np.float64)
     places = np.stack([i, j, k], axis=-1) @ AFFINE[:3, :3].T + AFFINE[:3, 3]
     hu = np.full(SHAPE, -800.0)
-    for number, (_, radius) in enumerate(BALLS):
-        away = np.linalg.norm(places - middle(number), axis=-1) - radius
+    for number, ball in enumerate(BALLS):
+        away = np.linalg.norm(places - middle(number), axis=-1) - ball.radius_mm
         hu = np.maximum(hu, np.clip(ISO - 250.0 * away, -800.0, 1000.0))
     return Volume(np.rint(scale * hu).astype(dtype), affine)
 
 
 def make_mesh(*, at: np.ndarray | None = None, radius: float = 4.0) -> Mesh:
     """A ball in front of the scan."""
-    vertices, triangles = ball(radius, rings=24)
+    vertices, triangles = samples.ball(radius, rings=24)
     return Mesh(vertices + (middle(0) + (0.0, -25.0, 0.0) if at is None else at), triangles)
 
 

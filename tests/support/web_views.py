@@ -139,6 +139,11 @@ class Client:
         self._news = asyncio.Event()
         self._reader = asyncio.ensure_future(self._read())
 
+    @property
+    def is_sharp(self) -> bool:
+        """Whether there is a picture, and the latest is sharp."""
+        return bool(self.pictures) and bool(self.pictures[-1][0]["sharp"])
+
     async def tell(self, type: str = "command", **message: Any) -> None:
         await self.socket.send_str(json.dumps({"type": type, **message}))
 

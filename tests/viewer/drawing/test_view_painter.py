@@ -161,7 +161,7 @@ MIDDLE_OF_THE_MESH = scenes.middle(0) + (0.0, -25.0, 0.0)
 def test_pick_finds_the_nearest_object_in_each_projection(open_model_and_painter, perspective, number, point):
     model, painter = open_model_and_painter(scenes.make_scan(), scenes.make_mesh())
     model.set_perspective(on=perspective)
-    x, y = model.camera.project([point], SIZE)[0][0]
+    ((x, y),), _ = model.camera.project([point], SIZE)
     pick = painter.pick(model.state, SIZE, x=x, y=y)
     assert (pick.object, pick.part) == (number, str(number))
 
@@ -175,7 +175,8 @@ def test_pick_of_a_cloud_is_one_of_its_points_without_hu(open_model_and_painter)
     cloud = scenes.make_cloud()
     model, painter = open_model_and_painter(cloud)
     nearest = cloud.points[np.argmin(cloud.points[:, 1])]  # the view is from anterior
-    pick = painter.pick(model.state, SIZE, *model.camera.project([nearest], SIZE)[0][0])
+    ((x, y),), _ = model.camera.project([nearest], SIZE)
+    pick = painter.pick(model.state, SIZE, x=x, y=y)
     assert pick.point == pytest.approx(nearest, abs=1e-4)  # mm, in float32; measured 1e-6
     assert (pick.object, pick.hu) == (1, None)
 
@@ -276,7 +277,7 @@ def test_clip_through_a_ball_leaves_a_closed_half_of_it_in_mesh_and_picture(open
     quality = mesh.quality()
     assert quality["closed"]
     assert mesh.bounds[1, 0] == pytest.approx(middle_x, abs=0.02)  # vertices in float32, held off samples
-    half_ball_ml = 2 / 3 * np.pi * scenes.BALLS[0][1] ** 3 / 1000.0
+    half_ball_ml = 2 / 3 * np.pi * scenes.BALLS[0].radius_mm ** 3 / 1000.0
     assert quality["volume_ml"] == pytest.approx(half_ball_ml, rel=0.035)  # voxels of about 1 mm; measured 0.983 of it
     drawn = render([(mesh, MeshLook())], camera=model.camera, size=SIZE, background="transparent", device=device)
     assert ((picture.image[..., 3] > 0) != (drawn.image[..., 3] > 0)).mean() < 0.005  # of pixels, at outlines
@@ -367,7 +368,8 @@ def test_view_without_the_table_draws_the_scan_without_its_voxels(open_model_and
     monkeypatch.setattr(stage, "remove_table", remove)
     before = shown_pixels(painter.picture(model.state, SIZE))
     assert not painter.knows_table
-    assert painter.remove_table()[1]["dense_voxels_removed"] == 7 and painter.knows_table
+    [facts] = painter.remove_table().values()
+    assert facts["dense_voxels_removed"] == 7 and painter.knows_table
     model.set_table(shown=False)
     assert 0 < shown_pixels(painter.picture(model.state, SIZE)) < before
     model.undo()

@@ -37,8 +37,8 @@ def test_parts_lie_over_their_bone_in_slices_of_an_uneven_scan(open_model_and_pa
     model, painter = open_model_and_painter(Volume(scan.voxels, scan.affine, slice_positions=heights))
     find(model, painter)
     model.set_color("1/1", (1.0, 0.0, 0.0))
-    at = painter.objects[0].volume.ijk_to_lps([scenes.BALLS[0][0]])[0]
-    model.set_cross(tuple(at))
+    [middle] = painter.objects[0].volume.ijk_to_lps([scenes.BALLS[0].middle_ijk])
+    model.set_cross(tuple(middle))
     picture = painter.slice(model.state, plane, (200, 200))
     tinted = picture.image[..., 0].astype(int) - picture.image[..., 1] > 30  # of 255: more red than green
     bone = np.nan_to_num(picture.values, nan=-1000.0) >= scenes.ISO
@@ -73,7 +73,7 @@ def test_model_and_painter_know_that_parts_are_found(open_model_and_painter):
 def test_part_of_a_ball_has_its_volume_its_box_and_a_point_in_it(open_model_and_painter, number):
     model, painter = open_model_and_painter()
     find(model, painter)
-    middle, radius = scenes.middle(number), scenes.BALLS[number][1]
+    middle, radius = scenes.middle(number), scenes.BALLS[number].radius_mm
 
     (part,) = (part for part in model.state.parts if part.key == f"1/{number + 1}")
 
@@ -173,7 +173,7 @@ def test_volume_rendering_leaves_hidden_parts_out_with_their_edges(open_model_an
     model.only("1/3")
     picture = painter.picture(model.state, SIZE)
     rows, columns = np.nonzero(picture.image[..., 3] > 8)
-    spot = model.camera.project([scenes.middle(2)], SIZE)[0][0]
+    (spot,), _ = model.camera.project([scenes.middle(2)], SIZE)
     assert 0 < len(rows) < 0.3 * before  # the smallest of three balls; measured 128 of 1394 pixels
     away_mm = np.hypot(columns + 0.5 - spot[0], rows + 0.5 - spot[1]) * model.camera.pixel_mm(SIZE)
     assert away_mm.max() < 6.5  # measured 6.4; with the ball beside it, 5.8 mm away and 5 mm in radius, 10.8
@@ -184,8 +184,9 @@ def first_part(open_model_and_painter):
     """The model, the painter, the plain picture, and the pixel (row, column) of the middle of part 1."""
     model, painter = open_model_and_painter()
     find(model, painter)
-    x, y = model.camera.project([scenes.middle(0)], SIZE)[0][0].astype(int)
-    return model, painter, painter.picture(model.state, SIZE), (y, x)
+    (pixel,), _ = model.camera.project([scenes.middle(0)], SIZE)
+    column, row = pixel.astype(int)
+    return model, painter, painter.picture(model.state, SIZE), (row, column)
 
 
 def test_part_of_a_scan_is_drawn_in_its_colour_and_opacity(first_part):
@@ -196,9 +197,11 @@ def test_part_of_a_scan_is_drawn_in_its_colour_and_opacity(first_part):
     model.set_opacity("1/1", 0.5)
     translucent = painter.picture(model.state, SIZE)
 
-    assert red.image[pixel][0] > 200 and red.image[pixel][1] < 100  # of 255: red in the light; measured 255 and 51
-    assert plain.image[pixel][1] > 200  # measured 255
-    assert translucent.image[pixel][3] == pytest.approx(0.5 * 255, abs=1)
+    red_level, green_level, *_ = red.image[pixel]
+    _, green_before, *_ = plain.image[pixel]
+    assert red_level > 200 and green_level < 100  # of 255: red in the light; measured 255 and 51
+    assert green_before > 200  # measured 255
+    assert translucent.image[(*pixel, 3)] == pytest.approx(0.5 * 255, abs=1)
 
 
 def test_mesh_of_a_coloured_part_is_apart_from_the_rest_with_its_colour(first_part):
@@ -228,7 +231,7 @@ def labelled(open_model_and_painter):
     model, painter = open_model_and_painter(scenes.make_scan(), scenes.make_labels())
     assert painter.find_parts(model.state) == []
     assert model.parts_known
-    one, two = model.camera.project([scenes.middle(0), scenes.middle(1)], SIZE)[0]
+    (one, two), _ = model.camera.project([scenes.middle(0), scenes.middle(1)], SIZE)
     return model, painter, one, two
 
 

@@ -68,7 +68,7 @@ def picture(view: ViewSession, *, moving: bool = False) -> Rendering:
 
 def picked_radius(view: ViewSession) -> float:
     """Distance of what is seen in front of the middle of the ball from that middle, mm."""
-    x, y = view.model.camera.project([MIDDLE], SIZE)[0][0]
+    ((x, y),), _ = view.model.camera.project([MIDDLE], SIZE)
     pick = view.do({"do": "pick", "x": float(x), "y": float(y), "size": list(SIZE)})["pick"]
     return float(np.linalg.norm(np.subtract(pick["point"], MIDDLE)))
 
@@ -161,7 +161,7 @@ def test_parts_of_a_fitted_surface_are_hidden_picked_and_translucent(open_sessio
     do(view, "show", key=one_key, visible=False)
     assert shown_pixels(picture(view)) == pytest.approx(0.5 * both, rel=0.05)  # one of two equal balls
     do(view, "show", key=one_key, visible=True)
-    x, y = view.model.camera.project([MIDDLE + [0.0, 0.0, 40.0]], SIZE)[0][0]
+    ((x, y),), _ = view.model.camera.project([MIDDLE + [0.0, 0.0, 40.0]], SIZE)
     upper = view.do({"do": "pick", "x": float(x), "y": float(y), "size": list(SIZE)})["pick"]["part"]
     assert upper in ("1/1", "1/2") and view.model.state.part(upper).kind == "cluster"
     do(view, "set_opacity", key=upper, value=0.3)

@@ -35,7 +35,7 @@ def open_session(device):
 
 def pixel(session: ViewSession, number: int) -> dict:
     """Arguments of a command at the middle of a ball."""
-    x, y = session.model.camera.project([scenes.middle(number)], SIZE)[0][0]
+    ((x, y),), _ = session.model.camera.project([scenes.middle(number)], SIZE)
     return {"x": float(x), "y": float(y), **AT}
 
 
@@ -301,12 +301,13 @@ def test_point_of_a_tool_beside_all_objects_is_none(scan_view):
 @pytest.mark.opencl
 def test_point_of_a_tool_in_a_slice_is_the_place_of_its_pixel(scan_view):
     camera = scan_view.painter.slice_camera(scan_view.model.state, "axial", SIZE)
-    x, y = camera.project([scenes.middle(0)], SIZE)[0][0]
+    ((x, y),), _ = camera.project([scenes.middle(0)], SIZE)
     scan_view.do({"do": "start_tool", "name": "seed"})
 
     facts = scan_view.do({"do": "add_point", "x": x, "y": y, **AT, "plane": "axial"})
 
-    assert facts["measure"]["points"][0] == pytest.approx(scenes.middle(0), abs=1e-3)  # facts have 3 decimals
+    (place,) = facts["measure"]["points"]
+    assert place == pytest.approx(scenes.middle(0), abs=1e-3)  # facts have 3 decimals
 
 
 @pytest.mark.opencl

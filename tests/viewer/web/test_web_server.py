@@ -136,10 +136,10 @@ def test_view_that_changes_is_drawn_coarse_and_then_sharp_at_rest(served: WebSer
     async def browse() -> list[tuple[dict[str, Any], Any]]:
         async with browsing(served) as client:
             await client.lay_out()
-            await client.until(lambda: client.pictures and client.pictures[-1][0]["sharp"])
+            await client.until(lambda: client.is_sharp)
             before = len(client.pictures)
             await client.tell(do="set_iso", hu=250)
-            await client.until(lambda: len(client.pictures) > before and client.pictures[-1][0]["sharp"])
+            await client.until(lambda: len(client.pictures) > before and client.is_sharp)
             return client.pictures[before:]
 
     pictures = asyncio.run(browse())
@@ -174,8 +174,9 @@ def test_browser_that_shows_its_picture_late_gets_the_newest(served: WebServer) 
         async with browsing(served) as client:
             await change_iso_40_times_unshown(client)
             client.shows = True
-            await client.tell("shown", number=client.pictures[0][0]["number"])
-            await client.until(lambda: client.pictures[-1][0]["sharp"] and len(client.pictures) > 1)
+            [(head, _)] = client.pictures
+            await client.tell("shown", number=head["number"])
+            await client.until(lambda: client.is_sharp and len(client.pictures) > 1)
             return client.pictures[-1]
 
     assert grey(asyncio.run(browse())) == pytest.approx(240, abs=JPEG_GREYS)
@@ -189,12 +190,12 @@ def test_browser_that_changes_its_view_leaves_that_of_another(served: WebServer)
         async with browsing(served) as one, browsing(served) as other:
             for client in (one, other):
                 await client.lay_out()
-                await client.until(lambda client=client: client.pictures and client.pictures[-1][0]["sharp"])
+                await client.until(lambda client=client: client.is_sharp)
             before = seen(other)
             await one.tell(do="set_iso", hu=120)
             await one.tell(do="turn", dx=0.2, dy=0.1)
             await one.until(lambda: one.facts["iso"]["hu"] == 120 and one.facts["camera"] != before[1])
-            await one.until(lambda: one.pictures[-1][0]["sharp"] and grey(one.pictures[-1]) < 130)  # of 120 HU
+            await one.until(lambda: one.is_sharp and grey(one.pictures[-1]) < 130)  # of 120 HU
             return [before, seen(other)]
 
     before, after = asyncio.run(browse())
@@ -222,7 +223,7 @@ def test_picture_after_one_that_failed_is_shown(served: WebServer, views: Views)
             await client.lay_out()
             await client.until(lambda: client.notes)
             await client.tell(do="set_iso", hu=222)
-            await client.until(lambda: client.pictures and client.pictures[-1][0]["sharp"])
+            await client.until(lambda: client.is_sharp)
             return client.pictures[-1]
 
     assert grey(asyncio.run(browse())) == pytest.approx(222, abs=JPEG_GREYS)

@@ -105,7 +105,7 @@ def test_click_with_shift_says_part_ml_and_hu_of_the_surface(page_with_chosen_ba
 def test_click_with_shift_moves_the_slices_to_the_surface_that_was_met(page_with_chosen_ball) -> None:
     from_middle = np.array(facts(page_with_chosen_ball)["cross"]) - scenes.middle(1)
 
-    assert np.linalg.norm(from_middle) == pytest.approx(scenes.BALLS[1][1], abs=tolerances.VIEW_CLICK_MM)
+    assert np.linalg.norm(from_middle) == pytest.approx(scenes.BALLS[1].radius_mm, abs=tolerances.VIEW_CLICK_MM)
 
 
 def test_click_with_shift_chooses_the_row_of_the_part(page_with_chosen_ball) -> None:
@@ -221,7 +221,7 @@ def test_clicks_of_a_distance_meet_the_balls_that_they_point_at(page) -> None:
     first, second, _ = measure_distance(page, first=1, second=2)
 
     from_middles = [np.linalg.norm(first - scenes.middle(1)), np.linalg.norm(second - scenes.middle(2))]
-    radii = [scenes.BALLS[1][1], scenes.BALLS[2][1]]
+    radii = [scenes.BALLS[1].radius_mm, scenes.BALLS[2].radius_mm]
     assert from_middles == pytest.approx(radii, abs=tolerances.VIEW_CLICK_MM)
 
 
@@ -256,7 +256,7 @@ def test_line_between_two_balls_is_in_sight_from_behind_in_one_piece_between_the
 
     (length,) = lengths_in_sight(page, "posterior")  # one piece
 
-    hidden_by_the_first = scenes.BALLS[0][1]  # at least its radius: the line begins on its far side
+    hidden_by_the_first = scenes.BALLS[0].radius_mm  # at least its radius: the line begins on its far side
     assert tolerances.VIEW_LINE_SEEN_MM < length < np.linalg.norm(second - first) - hidden_by_the_first
     assert len(page.find_elements("css selector", "#scene .line.seen")) == 1
 
