@@ -25,19 +25,20 @@
 #define MOST_WALKS 32
 
 /* Parameters  places   in   (n, 3) mm
- *             faces    in   (count, 3)
- *             frames   out  (3 count,) of each face the first corner and the edges from it
+ *             faces    in   (faces, 3)
+ *             frames   out  (3 faces,) of each face the first corner and the edges from it
+ *             rows     in   (count,) the faces that are looked at
  *             count
  * Launch      global = count, rounded up by the host, any local
  * Assumes     all vertices are below n
- * Guarantees  written for every face */
+ * Guarantees  written for each of the rows */
 __kernel void frame_faces(
     __global const float *restrict places, __global const uint *restrict faces, __global float4 *restrict frames,
-    const uint count)
+    __global const uint *restrict rows, const uint count)
 {
-    const uint face = get_global_id(0);
-    if (face >= count)
+    if (get_global_id(0) >= count)
         return;
+    const uint face = rows[get_global_id(0)];
     const uint3 corners = vload3(face, faces);
     const float3 one = place_of(places, corners.x);
     const float3 p = place_of(places, corners.y) - one, q = place_of(places, corners.z) - one;
@@ -52,16 +53,20 @@ __kernel void frame_faces(
  *             stars   out  (7 n,) of each vertex the edges from it in its first eight faces, a lane for each: x, y and z of
  *                     the one to the next corner, and of the one to the corner after that, and the row of the face; the
  *                     last face fills the rest
+ *             vertices   in   (count,) the vertices that are looked at
  *             count
  * Launch      global = count, rounded up by the host, any local
  * Assumes     all rows are below the number of faces
- * Guarantees  written for every vertex that has a face */
+ * Guarantees  written for each of the vertices that has a face */
 __kernel void gather_stars(
     __global const float *restrict places, __global const uint *restrict faces, __global const int *restrict begin,
-    __global const int *restrict around, __global float *restrict stars, const uint count)
+    __global const int *restrict around, __global float *restrict stars, __global const uint *restrict vertices,
+    const uint count)
 {
-    const uint vertex = get_global_id(0);
-    if (vertex >= count || begin[vertex] == begin[vertex + 1u])
+    if (get_global_id(0) >= count)
+        return;
+    const uint vertex = vertices[get_global_id(0)];
+    if (begin[vertex] == begin[vertex + 1u])
         return;
     const float3 own = place_of(places, vertex);
     for (int lane = 0; lane < 8; ++lane) {
@@ -83,46 +88,60 @@ __kernel void gather_stars(
 
 typedef struct { float3 a, b, c; } triangle;
 
-/* The piece of a triangle at the end of a path.  (Its corners are read anew: rusticl of Mesa 22 changes the triangle that
- * a function is given.  It is no result: that of three vectors is `noalias`, which Oclgrind 21.10 does not know.) */
+/* Cut a piece at the middle of its longest edge, and keep its first or its second half. */
+static inline void halve_piece(triangle *piece, const int second)
+{
+    const float3 a = piece->a, b = piece->b, c = piece->c, p = b - a, q = c - b, r = a - c;
+    const float one = dot3(p, p), two = dot3(q, q), three = dot3(r, r);
+    const int at_p = one >= two && one >= three, at_q = !at_p && two >= three;
+    const float3 middle = 0.5f * (at_p ? a + b : at_q ? b + c : c + a);
+    /* the corner that the half does not keep: the first end of the edge in the second half, else the other end */
+    const int gone = at_p ? (second ? 0 : 1) : at_q ? (second ? 1 : 2) : (second ? 0 : 2);
+    piece->a = gone == 0 ? middle : a;
+    piece->b = gone == 1 ? middle : b;
+    piece->c = gone == 2 ? middle : c;
+}
+
+/* The piece of a triangle at the end of a path.  (It is no result: that of three vectors is `noalias`, which Oclgrind 21.10
+ * does not know.) */
 static inline void find_piece(
     __global const float *triangles, const uint number, const uint path, const uint cuts, triangle *piece)
 {
-    float3 a = vload3(3u * number, triangles), b = vload3(3u * number + 1u, triangles),
-           c = vload3(3u * number + 2u, triangles);
-    for (uint cut = 0; cut < cuts; ++cut) {
-        const float3 p = b - a, q = c - b, r = a - c;
-        const float one = dot3(p, p), two = dot3(q, q), three = dot3(r, r);
-        const int second = (int)(path >> (cuts - 1u - cut) & 1u);
-        const int at_p = one >= two && one >= three, at_q = !at_p && two >= three;
-        const float3 middle = 0.5f * (at_p ? a + b : at_q ? b + c : c + a);
-        /* the corner that the piece does not keep: the first end of the edge in the second piece, else the other end */
-        const int gone = at_p ? (second ? 0 : 1) : at_q ? (second ? 1 : 2) : (second ? 0 : 2);
-        a = gone == 0 ? middle : a;
-        b = gone == 1 ? middle : b;
-        c = gone == 2 ? middle : c;
-    }
-    piece->a = a;
-    piece->b = b;
-    piece->c = c;
+    piece->a = vload3(3u * number, triangles);
+    piece->b = vload3(3u * number + 1u, triangles);
+    piece->c = vload3(3u * number + 2u, triangles);
+    for (uint cut = 0; cut < cuts; ++cut)
+        halve_piece(piece, (int)(path >> (cuts - 1u - cut) & 1u));
 }
 
+/* Which of two faces has all corners of a piece within the limit: bits 1 and 2. */
 #if LANES == 8
-static inline int is_near_all(const target *to, const triangle piece, const int face, const float limit)
+static inline int is_near_all(const target *to, const triangle *piece, const int face, const int other, const float limit)
 {
     const float4 one = to->frames[3 * face], p = to->frames[3 * face + 1], q = to->frames[3 * face + 2];
-    const float3 a = piece.a - one.xyz, b = piece.b - one.xyz, c = piece.c - one.xyz;
-    return all(
-        four_in_frame(
-            (float4)(a.x, b.x, c.x, c.x), (float4)(a.y, b.y, c.y, c.y), (float4)(a.z, b.z, c.z, c.z), (float4)(p.x),
-            (float4)(p.y), (float4)(p.z), (float4)(q.x), (float4)(q.y), (float4)(q.z))
-        < (float4)(limit));
+    const float4 two = to->frames[3 * other], r = to->frames[3 * other + 1], s = to->frames[3 * other + 2];
+    const float4 x = {piece->a.x, piece->b.x, piece->c.x, piece->c.x}, y = {piece->a.y, piece->b.y, piece->c.y, piece->c.y},
+                 z = {piece->a.z, piece->b.z, piece->c.z, piece->c.z};
+    const int8 is_near = squares_in_frames(
+                             (float8)(x - one.x, x - two.x), (float8)(y - one.y, y - two.y),
+                             (float8)(z - one.z, z - two.z), (float8)((float4)(p.x), (float4)(r.x)),
+                             (float8)((float4)(p.y), (float4)(r.y)), (float8)((float4)(p.z), (float4)(r.z)),
+                             (float8)((float4)(q.x), (float4)(s.x)), (float8)((float4)(q.y), (float4)(s.y)),
+                             (float8)((float4)(q.z), (float4)(s.z)))
+        < (float8)(limit);
+    return all(is_near.lo) | all(is_near.hi) << 1;
 }
 #else
-static inline int is_near_all(const target *to, const triangle piece, const int face, const float limit)
+static inline int is_near_one(const target *to, const triangle *piece, const int face, const float limit)
 {
-    return square_to(to, piece.a, face) < limit && square_to(to, piece.b, face) < limit
-        && square_to(to, piece.c, face) < limit;
+    return square_to(to, piece->a, face) < limit && square_to(to, piece->b, face) < limit
+        && square_to(to, piece->c, face) < limit;
+}
+
+static inline int is_near_all(const target *to, const triangle *piece, const int face, const int other, const float limit)
+{
+    const int first = is_near_one(to, piece, face, limit);
+    return first | (int)(!first && other != face && is_near_one(to, piece, other, limit)) << 1;
 }
 #endif
 
@@ -185,16 +204,17 @@ __kernel void find_near_faces(
     int face = hint.x, from = hint.x == NO_FACE ? hint.y : (int)faces[3u * (uint)hint.x], uses = 0;
     uint path = 0, cuts = 0;
     int is_going = 1, is_far = 0;
+    triangle now;
+    find_piece(triangles, number, path, cuts, &now);
     for (uint piece = 0; is_going; ++piece) {
-        triangle now;
-        find_piece(triangles, number, path, cuts, &now);
-        int is_near = face != NO_FACE && is_near_all(&to, now, face, limit);
-        for (int other = 0; other < 2 && !is_near; ++other) { /* those of pieces before */
-            const int earlier = other == 0 ? used.x : used.y;
-            if (earlier != NO_FACE && is_near_all(&to, now, earlier, limit)) {
-                face = earlier;
-                is_near = 1;
-            }
+        /* the last face, and those of pieces before */
+        const int is_last = used.x == face, before = is_last ? used.y : used.x, third = is_last ? NO_FACE : used.y;
+        int is_near = 0;
+        if (face != NO_FACE) {
+            is_near = is_near_all(&to, &now, face, before == NO_FACE ? face : before, limit);
+            if (is_near == 0 && third != NO_FACE)
+                is_near = is_near_all(&to, &now, third, third, limit) << 2;
+            face = (is_near & 1) ? face : (is_near & 2) ? before : is_near ? third : face;
         }
         if (!is_near) {
             const float3 middle = (now.a + now.b + now.c) * (1.0f / 3.0f);
@@ -207,7 +227,7 @@ __kernel void find_near_faces(
             if (!is_far) {
                 face = nearest;
                 from = (int)faces[3u * (uint)nearest];
-                is_near = is_near_all(&to, now, face, limit);
+                is_near = is_near_all(&to, &now, face, face, limit);
             }
         }
         if (is_near) {
@@ -221,10 +241,13 @@ __kernel void find_near_faces(
             }
             path |= 1u;
             is_going = cuts > 0;
+            if (is_going)
+                find_piece(triangles, number, path, cuts, &now);
         } else {
             is_far |= cuts == MOST_CUTS;
             path <<= 1;
             ++cuts;
+            halve_piece(&now, 0);
         }
         is_far |= piece == MOST_PIECES;
         is_going &= !is_far;

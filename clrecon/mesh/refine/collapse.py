@@ -58,12 +58,6 @@ class Surface:
     mean_edge: float
 
     @staticmethod
-    def of_faces(places: Float32Array, triangles: NDArray[np.uint32]) -> Surface:
-        """A surface to measure distances to, without half-edges."""
-        none = np.zeros(0, np.uint32)
-        return Surface(places, triangles, Fans(triangles, len(places)), none, none, 0.0)
-
-    @staticmethod
     def of(places: Float32Array, triangles: NDArray[np.uint32], edges: Edges) -> Surface:
         corners = triangles.reshape(-1)
         opposite, leaving = np.full(triangles.size, NONE, np.uint32), np.full(len(places), NONE, np.uint32)
@@ -117,7 +111,7 @@ class History:
     def latest(self) -> IntArray:
         """Return the last collapse into each vertex, -1 where there is none."""
         gone = np.flatnonzero(self.into >= 0)
-        gone = gone[np.argsort(self.rounds[gone], kind="stable")]
+        gone = gone[np.argsort(self.rounds[gone].astype(np.int16), kind="stable")]  # those of 16 bits by counting
         last = np.full(len(self.into), -1)
         last[self.into[gone]] = gone
         return last
@@ -193,12 +187,20 @@ class Collapser(Protocol):
     def finish(self) -> tuple[History, Pairing]:
         """Return the collapses, and where the surfaces are near each other."""
 
+    def show_present(self, places: Float32Array, faces: NDArray[np.uint32], rows: IntArray, changed: IntArray) -> None:
+        """Bring the present surface to the device, of which some faces have changed since the last time.
+
+        places: ndarray, shape (n, 3). Of given vertices, as `faces`, shape (k, 3).
+        rows: ndarray, shape (k,). The given triangle from which each face comes; their numbers are those of faces.
+        """
+
     def find_near_faces(
-        self, corners: Float32Array, hints: NDArray[np.int32], surface: Surface, limit: float
+        self, corners: Float32Array, hints: NDArray[np.int32], present: bool, limit: float
     ) -> NDArray[np.int32]:
         """Find faces that show that triangles, shape (k, 3, 3), lie within a distance of a surface at all their points.
 
         hints: ndarray, shape (k, 4). A face of the surface near each triangle, or -1; a vertex near each corner.
+        present: The surface is the present one, else the given one.
         limit: Square of the distance in mm2.
         Returns: shape (k, 4). Faces of the surface, and -1; all SEVERAL where there are more than four; all FAR where
             none is found for a part of the triangle.

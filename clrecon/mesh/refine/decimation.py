@@ -13,7 +13,7 @@ from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.exchange.coordinates import as_stored, find_coincident, rounding_step
 from clrecon.mesh.compare.distances import rounding_of_bounds
 from clrecon.mesh.connectivity import find_edges, find_used, label_components, number_used, order_by_number
-from clrecon.mesh.intersections import FindCrossings, find_self_intersections
+from clrecon.mesh.intersections import FindCrossings, find_changed_intersections, find_self_intersections
 from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.refine.collapse import FAR, SEVERAL, Collapser, Surface, collapse_in_rounds
 from clrecon.mesh.refine.topology import TopologyChange, any_corner, compare_topology, measure_topology
@@ -151,7 +151,7 @@ class _Decimation:
     def mend(self) -> int:
         """Undo collapses until no fault is left; return their number."""
         before = self._history.count
-        self._witnesses = np.full((self._mesh.triangle_count, 4), SEVERAL, np.int32)
+        self._witnesses = np.full((4, self._mesh.triangle_count), SEVERAL, np.int32)
         self._is_new = np.ones(self._mesh.vertex_count, dtype=bool)
         while True:
             self._name()
@@ -164,10 +164,11 @@ class _Decimation:
     def _name(self) -> None:
         """Find the present faces, the given triangles that they come from, and the places as they will be stored."""
         self._names = self._history.names()
-        named = self._names.astype(np.uint32)[self._mesh.triangles]
+        named = self._names.astype(np.uint32).take(self._mesh.triangles)
         a, b, c = named.T
         self._rows = np.flatnonzero((a != b) & (b != c) & (c != a))
-        self._faces = named[self._rows]
+        self._faces = named.take(self._rows, axis=0)
+        self._is_new_face = any_corner(self._is_new, self._faces)
         stored = as_stored(self._history.places + self._origin)
         self._has_moved = (self._history.places != self._given.places).any(axis=1)
         self._stored = np.where(self._has_moved[:, None], stored, self._mesh.vertices)
@@ -178,43 +179,38 @@ class _Decimation:
 
         Given triangles are looked at again if one of the faces that were near has changed.
         """
-        triangles, places = self._mesh.triangles, self._history.places
-        is_new = any_corner(self._is_new, self._faces)
-        rows = self._find_unseen(is_new)
-        number = np.full(len(triangles) + 1, -1, np.int32)
-        number[self._rows] = np.arange(len(self._rows), dtype=np.int32)
-        standing = find_used(self._faces, len(places))
-        row = np.zeros(len(places), np.uint32)
-        row[standing] = np.arange(len(standing), dtype=np.uint32)
-        present = Surface.of_faces(places[standing], row[self._faces])
-        hints = np.column_stack([number[self._pairing.faces_at[rows]], row[self._names[triangles[rows]]]]).astype(
-            np.int32
-        )
-        near = self._collapser.find_near_faces(self._given.places[triangles[rows]], hints, present, self._limit)
-        self._witnesses[rows] = np.where(near >= 0, np.append(self._rows, -1)[near], near)
-        yield self._names[triangles[rows[near[:, 0] == FAR]]]
-        faces = np.flatnonzero(is_new & any_corner(self._has_moved, self._faces))
-        corners = self._faces[faces]
-        hints = np.column_stack([self._pairing.below[self._rows[faces]], self._pairing.homes[corners]]).astype(np.int32)
-        near = self._collapser.find_near_faces(places[corners], hints, self._given, self._limit)
+        places = self._history.places
+        new = np.flatnonzero(self._is_new_face)
+        self._collapser.show_present(places, self._faces, self._rows, new)
+        rows = self._find_unseen(self._rows[new])
+        corners = self._mesh.triangles.take(rows, axis=0)
+        names = self._names.take(corners)
+        hints = np.column_stack([self._pairing.faces_at[rows], names]).astype(np.int32, copy=False)
+        near = self._collapser.find_near_faces(self._given.places.take(corners, axis=0), hints, True, self._limit)
+        self._witnesses[:, rows] = near.T
+        yield names[near[:, 0] == FAR]
+        faces = new[any_corner(self._has_moved, self._faces.take(new, axis=0))]
+        corners = self._faces.take(faces, axis=0)
+        hints = np.column_stack([self._pairing.below[self._rows[faces]], self._pairing.homes.take(corners)])
+        hints = hints.astype(np.int32, copy=False)
+        near = self._collapser.find_near_faces(places.take(corners, axis=0), hints, False, self._limit)
         yield corners[near[:, 0] == FAR]
 
-    def _find_unseen(self, is_new: NDArray[np.bool_]) -> IntArray:
+    def _find_unseen(self, new: IntArray) -> IntArray:
         """Find given triangles that have moved and that no face that is still there shows to be near."""
-        has_changed = np.ones(self._mesh.triangle_count + 1, dtype=bool)
-        has_changed[self._rows] = is_new
-        has_changed[-1] = False  # no face
-        is_unseen = np.zeros(self._mesh.triangle_count, dtype=bool)
-        for faces in self._witnesses.T:
-            is_unseen |= (faces < -1) | has_changed[np.maximum(faces, -1)]
-        return np.flatnonzero(is_unseen & any_corner(self._has_moved, self._mesh.triangles))
+        is_unseen = np.zeros(self._mesh.triangle_count - FAR, dtype=bool)
+        is_unseen[new] = True
+        is_unseen[[SEVERAL, FAR]] = True  # from the end, and -1 is no face
+        has_none = np.logical_or.reduce([is_unseen[faces] for faces in self._witnesses])
+        return np.flatnonzero(has_none & any_corner(self._has_moved, self._mesh.triangles))
 
     def _find_unsound(self) -> Iterator[IntArray]:
         """Find the names at faces that cut each other or have no area, and at vertices that coincide."""
-        pairs = self._find_crossings(self._stored, self._faces, any_corner(self._is_new, self._faces))
+        pairs = find_changed_intersections(self._stored, self._faces, self._is_new_face, self._find_crossings)
         yield self._faces[pairs].reshape(-1, 6)
-        for piece, _, cross in cross_products(self._stored, self._faces, self._origin):
-            yield self._faces[piece][~cross.any(axis=0)]
+        new = self._faces[self._is_new_face]
+        for piece, _, cross in cross_products(self._stored, new, self._origin):
+            yield new[piece][~cross.any(axis=0)]
         standing = find_used(self._faces, len(self._stored))
         yield standing[find_coincident(self._stored[standing])][:, None]
 

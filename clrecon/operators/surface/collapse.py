@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from clrecon import opencl as ocl
 from clrecon.errors import UsageError
+from clrecon.mesh.connectivity import Fans, find_used
 from clrecon.mesh.refine.collapse import NONE, History, Pairing, Surface
 from clrecon.opencl import Device
 
@@ -22,6 +23,7 @@ _MOST_POINTS = 2**28 - 1
 """Most points of the given surface in lists: their numbers have 28 bits."""
 
 Float32Array = NDArray[np.float32]
+IntArray = NDArray[np.integer]
 
 
 class DeviceCollapser:
@@ -71,7 +73,11 @@ class DeviceCollapser:
             "opposite": self._upload(given.opposite),
         }
         self._leaving = self._upload(given.leaving)
-        self._target = self._load_target(given)
+        self._target: dict[str, Any] = {}
+        self._present: dict[str, Any] = {}
+        fans = given.fans.begin, given.fans.rows
+        everything = np.arange(self._faces), np.arange(self._count)
+        self._load_target(self._target, given.places, given.triangles, fans, *everything)
         self._ranks = {
             "octaves": ocl.allocate(device, 3 * self._faces),
             "quadrics": ocl.allocate(device, 48 * self._count),
@@ -90,25 +96,32 @@ class DeviceCollapser:
             "neighbours": ocl.allocate(device, 4 * self._ring * self._count),
         }
 
-    def _load_target(self, surface: Surface) -> dict[str, Any]:
-        """Bring a surface to the device to which distances are measured."""
-        device, faces = self._device, len(surface.triangles)
-        arrays = {
-            "first_places": surface.places, "first_corners": surface.triangles.reshape(-1),
-            "begin": surface.fans.begin.astype(np.int32), "around": surface.fans.rows.astype(np.int32),
-        }  # fmt: skip
-        target = {
-            name: ocl.upload(device, array if len(array) else np.zeros(4, array.dtype))
-            for name, array in arrays.items()
-        }
-        program, places = self._within, len(surface.places)
-        of_faces = {"places": target["first_places"], "faces": target["first_corners"]}
-        frames, stars = ocl.allocate(device, 48 * max(faces, 1)), ocl.allocate(device, 224 * max(places, 1))
-        ocl.launch(device, program["frame_faces"], faces, **of_faces, frames=frames, count=faces)
-        around = {"begin": target["begin"], "around": target["around"]}
-        ocl.launch(device, program["gather_stars"], places, **of_faces, **around, stars=stars, count=places)
-        target |= {"frames": frames, "stars": stars}
-        return target
+    def _bring(self, array: NDArray[Any], kind: Any) -> Any:
+        return ocl.upload(self._device, array.astype(kind, copy=False) if len(array) else np.zeros(4, kind))
+
+    def _load_target(
+        self, target: dict[str, Any], places: Float32Array, corners: NDArray[np.uint32],
+        fans: tuple[IntArray, IntArray], rows: IntArray, vertices: IntArray,
+    ) -> None:  # fmt: skip
+        """Bring a surface to the device to which distances are measured; some of its faces and vertices are new.
+
+        corners: ndarray, shape (m, 3).
+        fans: Where the faces around each vertex begin in the list of these, and the list.
+        """
+        if not target:
+            target["frames"] = ocl.allocate(self._device, 48 * max(self._faces, 1))
+            target["stars"] = ocl.allocate(self._device, 224 * max(self._count, 1))
+        of_faces = {"places": self._bring(places, np.float32), "faces": self._bring(corners.reshape(-1), np.uint32)}
+        fans_d = {name: self._bring(array, np.int32) for name, array in zip(("begin", "around"), fans, strict=True)}
+        ocl.launch(
+            self._device, self._within["frame_faces"], len(rows), **of_faces, frames=target["frames"],
+            rows=self._bring(rows, np.uint32), count=len(rows),
+        )  # fmt: skip
+        ocl.launch(
+            self._device, self._within["gather_stars"], len(vertices), **of_faces, **fans_d, stars=target["stars"],
+            vertices=self._bring(vertices, np.uint32), count=len(vertices),
+        )  # fmt: skip
+        target |= {"first_places": of_faces["places"], "first_corners": of_faces["faces"], **fans_d}
 
     def _start(self) -> None:
         surface, leaving = self._surface, self._leaving
@@ -181,13 +194,20 @@ class DeviceCollapser:
             buffers.clear()
         return history, pairing
 
+    def show_present(self, places: Float32Array, faces: NDArray[np.uint32], rows: IntArray, changed: IntArray) -> None:
+        fans, corners = Fans(faces, self._count), np.zeros((self._faces, 3), np.uint32)
+        corners[rows] = faces
+        around = fans.begin, rows[fans.rows]
+        vertices = find_used(faces[changed], self._count)
+        self._load_target(self._present, places, corners, around, rows[changed], vertices)
+
     def find_near_faces(
-        self, corners: Float32Array, hints: NDArray[np.int32], surface: Surface, limit: float
+        self, corners: Float32Array, hints: NDArray[np.int32], present: bool, limit: float
     ) -> NDArray[np.int32]:
         device = self._device
         if len(corners) == 0:
             return np.zeros((0, 4), np.int32)
-        target = self._target if surface is self._given else self._load_target(surface)
+        target = self._present if present else self._target
         witnesses, witnesses_d = ocl.empty_output(device, (len(corners), 4), np.int32)
         ocl.launch(
             device, self._within["find_near_faces"], len(corners),

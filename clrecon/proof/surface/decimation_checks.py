@@ -234,7 +234,19 @@ def _check_near_faces(device: Device) -> str:
     given = Surface.of(vertices.astype(np.float32), triangles, find_edges(triangles, len(vertices)))
     hints = np.column_stack([np.full(len(triangles), -1), triangles]).astype(np.int32)
     corners = moved[triangles]
-    near = DeviceCollapser(device, given, _LIMIT_MM**2).find_near_faces(corners, hints, given, _LIMIT_MM**2)
+    collapser = DeviceCollapser(device, given, _LIMIT_MM**2)
+    near = collapser.find_near_faces(corners, hints, False, _LIMIT_MM**2)
+    rows, places = np.arange(len(triangles)), given.places.copy()
+    collapser.show_present(places, triangles, rows, rows)
+    places[triangles[len(triangles) // 3 : len(triangles) // 2]] += np.float32(0.4)
+    has_changed = (places != given.places).any(axis=1)[triangles].any(axis=1)
+    collapser.show_present(places, triangles, rows, np.flatnonzero(has_changed))
+    changed = DeviceCollapser(device, Surface.of(places, triangles, find_edges(triangles, len(places))), _LIMIT_MM**2)
+    require_equal(
+        collapser.find_near_faces(corners, hints, True, _LIMIT_MM**2),
+        changed.find_near_faces(corners, hints, False, _LIMIT_MM**2),
+        "faces of a surface that has changed in part",
+    )
     first, second = (share.ravel() / 3.0 for share in np.mgrid[:4, :4])
     weights = np.column_stack([first, second, 1.0 - first - second])[first + second < 1.0 + 1e-9]
     points = np.einsum("wc,kca->kwa", weights, corners[::4].astype(np.float64))
