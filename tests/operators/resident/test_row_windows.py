@@ -141,8 +141,10 @@ def test_slabs_with_a_single_slice_at_the_end_give_the_picture_of_the_whole(wind
     volume = noise_volume((13, 20, 40))
     view = {"camera": look(volume, towards, half_height=6.0), "size": (48, 41), "lighting": Lighting(), "ray_step": 0.2}
     whole = DeviceCaster(windowed)(volume, "dvr", FUNCTION, **view)
-    monkeypatch.setattr(ray_slabs, "plan_ray_slabs", lambda *_, **__: slices)
+    planned: list[int] = []
+    monkeypatch.setattr(ray_slabs, "plan_ray_slabs", lambda *_, **__: planned.append(slices) or slices)
     parts = DeviceCaster(windowed)(volume, "dvr", FUNCTION, **view)
+    assert planned == [slices]
     assert whole.image[..., 3].max() > 100  # of 255: something is shown; measured 253
     assert np.abs(premultiplied(whole.image) - premultiplied(parts.image)).max() <= tolerances.RAY_SAME_255
     for name in ("depth", "expected_depth"):

@@ -37,11 +37,13 @@ def test_slabs_of_any_thickness_give_the_same_mesh(device, shape, dtype, closed,
 
 def test_a_single_slice_in_slabs_of_one_gives_the_same_mesh(device):
     volume = random_volume((1, 6, 40))
-    assert_same(extract_in_slabs(volume, 3, device, slices=1), extract_isosurface(volume, 3, device=device))
+    mesh = extract_in_slabs(volume, 3, device, slices=1)
+    assert mesh.report["slabs"] == 1 + 2  # with a border at both ends
+    assert_same(mesh, extract_isosurface(volume, 3, device=device))
 
 
 def test_a_resident_volume_gives_the_same_surfaces_in_slabs_and_as_a_whole_in_turn(device, monkeypatch):
-    volume = smooth_volume()
+    volume = smooth_volume((23, 27, 45))
     with SurfaceExtractor(volume, device=device) as extractor:
         whole = extractor.extract(100, closed=False)
         with monkeypatch.context() as less_memory:
@@ -117,7 +119,9 @@ def test_slabs_without_a_surface_between_others_give_the_same_mesh(device):
     voxels = np.zeros((30, 8, 40), np.int16)
     voxels[3:6, 2:5, 5:9] = voxels[20:24, 3:6, 20:36] = 100
     volume = Volume(voxels, OBLIQUE)
-    assert_same(extract_in_slabs(volume, 50, device, slices=4), extract_isosurface(volume, 50, device=device))
+    mesh = extract_in_slabs(volume, 50, device, slices=4)
+    assert mesh.report["slabs"] == (30 + 2) // 4
+    assert_same(mesh, extract_isosurface(volume, 50, device=device))
 
 
 @pytest.mark.every_device
@@ -278,7 +282,9 @@ def test_a_memory_mapped_file_in_slabs_gives_the_same_mesh(device, tmp_path):
     volume = smooth_volume((23, 64, 128))
     np.save(tmp_path / "voxels.npy", volume.voxels)
     mapped = Volume(np.load(tmp_path / "voxels.npy", mmap_mode="r"), volume.affine)
-    assert_same(extract_in_slabs(mapped, 100, device, slices=5), extract_isosurface(volume, 100, device=device))
+    mesh = extract_in_slabs(mapped, 100, device, slices=5)
+    assert mesh.report["slabs"] == (23 + 2) // 5
+    assert_same(mesh, extract_isosurface(volume, 100, device=device))
 
 
 @pytest.mark.oclgrind
@@ -287,4 +293,6 @@ def test_a_memory_mapped_file_in_slabs_gives_the_same_mesh(device, tmp_path):
 def test_slabs_of_a_small_volume_give_the_same_mesh(device, closed, slices):
     volume = random_volume((5, 4, 40))
     expected = extract_isosurface(volume, 3, device=device, closed=closed)
-    assert_same(extract_in_slabs(volume, 3, device, slices=slices, closed=closed), expected)
+    mesh = extract_in_slabs(volume, 3, device, slices=slices, closed=closed)
+    assert mesh.report["slabs"] > 1
+    assert_same(mesh, expected)

@@ -17,7 +17,7 @@ from clrecon.labels import read_labels
 from clrecon.proof.phantom import KINDS, MATERIALS, PhantomSettings, label_materials, make_phantom, write_phantom
 from clrecon.proof.phantom.scene_plans import PLANS
 from clrecon.proof.phantom.scenes import TABLES
-from clrecon.proof.phantom.settings import TABLE_NAMES
+from clrecon.proof.phantom.settings import CENTRE_LPS_MM, TABLE_NAMES
 
 SCENES = {name: kind for name, kind in KINDS.items() if kind.is_scene}
 CLEAN = {"noise": 0.0, "point_spread_mm": 0.0}
@@ -126,12 +126,11 @@ def test_prone_head_has_the_same_values_at_the_same_places_in_a_turned_image() -
     supine, prone = (
         make_phantom(coarse_settings("head", prone=prone, table="flat", **CLEAN)) for prone in (False, True)
     )
-    centre_lps_mm = (-3.5, -142.25, -418.75)
     offsets = np.random.default_rng(2).uniform((-60.0, -60.0, -40.0), (60.0, 60.0, 40.0), (3000, 3))
 
     values = []
     for voxels, affine, _ in (supine, prone):
-        i, j, k = np.rint(apply_affine(np.linalg.inv(affine), centre_lps_mm + offsets)).astype(int).T
+        i, j, k = np.rint(apply_affine(np.linalg.inv(affine), CENTRE_LPS_MM + offsets)).astype(int).T
         values.append(voxels[k, j, i].astype(float))
 
     _, affine_of_prone, _ = prone

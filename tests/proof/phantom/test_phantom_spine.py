@@ -8,6 +8,7 @@ from variants import daily
 
 from clrecon.geometry import apply_affine
 from clrecon.proof.phantom import PhantomSettings, make_phantom
+from clrecon.proof.phantom.settings import CENTRE_LPS_MM
 from clrecon.proof.phantom.spine_parts import Anatomy
 from clrecon.proof.phantom.spine_plan import plan_anatomy
 from clrecon.proof.phantom.vertebra import canal_distance, vertebra_distance
@@ -109,7 +110,7 @@ def centre_of_t12(spine: tuple) -> np.ndarray:
 def test_left_marker_lies_on_the_left_alone(spine: tuple) -> None:
     _, _, truth = spine
     marker = np.array(truth["spine"]["left_marker_lps_mm"])
-    middle_x = -3.5  # of the phantom
+    middle_x, _, _ = CENTRE_LPS_MM
     mirrored = marker * (-1, 1, 1) + (2.0 * middle_x, 0, 0)
 
     assert truth["spine"]["left_marker_inside"]
@@ -139,10 +140,9 @@ def test_spine_has_the_same_anatomy_in_tilted_and_oblique_slices() -> None:
     size = {"size": (150, 140), "slices": 60, "spacing": (1.7, 1.6, 2.0)}
     straight = make_phantom(PhantomSettings(**size, **CLEAN))
     turned = make_phantom(PhantomSettings(**size, **CLEAN, tilt=14.0, oblique=(6.0, -9.0, 12.0)))
-    centre_lps_mm = (-3.5, -142.25, -418.75)
     offsets = np.random.default_rng(2).uniform((-70.0, -70.0, -35.0), (70.0, 70.0, 35.0), (4000, 3))
 
-    pair = np.stack([values_at(made, centre_lps_mm + offsets) for made in (straight, turned)]).astype(float)
+    pair = np.stack([values_at(made, CENTRE_LPS_MM + offsets) for made in (straight, turned)]).astype(float)
 
     # the nearest voxels of two grids differ at edges
     assert np.corrcoef(pair)[0, 1] > 0.93  # measured 0.965
