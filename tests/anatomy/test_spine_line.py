@@ -88,16 +88,16 @@ def test_the_sure_part_of_a_line_lies_within_it(phantom_line):
 
 
 @pytest.mark.parametrize(
-    ("cell", "more", "bends"),
+    ("cell", "gained", "bends"),
     [((1, 2), 0.049, False), ((1, 2), 0.051, True), ((0, 0), 0.070, False), ((0, 0), 0.0715, True)],
     ids=["aside for too little", "aside", "across the corner for too little", "across the corner"],
 )
-def test_a_path_bends_to_a_cell_that_gains_more_than_the_length_of_the_bend_costs(cell, more, bends):
+def test_a_path_bends_to_a_cell_that_gains_more_than_the_length_of_the_bend_costs(cell, gained, bends):
     """Straight on is free, a step aside costs 0.05, and one across the corner that times the root of 2: 0.0707."""
     middle = (1, 1)
     gain = np.full((2, 3, 3), -1.0, np.float32)
     gain[:, 1, 1] = 0.5
-    gain[1][cell] = 0.5 + more
+    gain[1][cell] = 0.5 + gained
     assert _best_path(gain).tolist() == [[0, *middle], [1, *(cell if bends else middle)]]
 
 
@@ -255,21 +255,21 @@ def test_only_the_sure_part_of_a_line_is_returned_on_request(cropped_scan):
     assert sure.ends == {"upper": None, "lower": None}
 
 
-def line_above_lost_slices(phantom, value):
+def line_above_lost_slices(phantom, *, hu):
     """Return the line of the phantom with one value in all of its lower slices, and the height where these begin."""
     volume, _ = phantom
     voxels = np.array(volume.voxels)
-    voxels[:25] = value
+    voxels[:25] = hu
     return find_spine_line(Volume(voxels, volume.affine)), float(volume.slice_origins()[24, 2])
 
 
 @pytest.mark.parametrize(
-    ("value", "words"),
+    ("hu", "words"),
     [(600, r"bone in its place \(\d+ HU\)"), (-1000, "air or fat in its place|no vertebral body")],
     ids=["bone", "air"],
 )
-def test_the_end_of_a_lost_spine_names_its_height_and_what_was_found_instead(phantom, value, words):
-    line, z_mm = line_above_lost_slices(phantom, value)
+def test_the_end_of_a_lost_spine_names_its_height_and_what_was_found_instead(phantom, hu, words):
+    line, z_mm = line_above_lost_slices(phantom, hu=hu)
     assert re.search(words, line.lower.because), line.lower.because
     assert line.lower.lost_mm == pytest.approx(z_mm, abs=5.0)  # cells are 4 mm high; measured 2.3
     assert line.lower.lost_mm < line.lower.z_mm
@@ -277,7 +277,7 @@ def test_the_end_of_a_lost_spine_names_its_height_and_what_was_found_instead(pha
 
 
 def test_the_end_of_a_spine_that_the_scan_cuts_is_not_lost(phantom):
-    line, _ = line_above_lost_slices(phantom, 600)
+    line, _ = line_above_lost_slices(phantom, hu=600)
     assert (line.upper.lost_mm, line.upper.because) == (None, "")
 
 

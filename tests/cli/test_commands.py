@@ -141,13 +141,13 @@ def test_verbose_mesh_is_measured_and_its_components_are_printed(
     assert "measuring the mesh" in printed.err
 
 
-@pytest.mark.parametrize(("level", "said"), [(["--preset", "skin"], "-500 HU (preset skin)"), (["--hu", "-400"], "")])
+@pytest.mark.parametrize(("level", "words"), [(["--preset", "skin"], "-500 HU (preset skin)"), (["--hu", "-400"], "")])
 def test_mesh_of_skin_is_warned_of_as_one_that_can_show_a_face(
-    device: Any, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], level: list[str], said: str
+    device: Any, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], level: list[str], words: str
 ) -> None:
     assert main(["mesh", str(ct), "-o", str(tmp_path / "a.stl"), *level, "--device", str(device.index)]) == 0
     captured = capsys.readouterr()
-    assert said in captured.out
+    assert words in captured.out
     assert captured.err.startswith("clrecon: warning: a surface of the skin can show a face")
 
 
@@ -204,13 +204,13 @@ def test_several_meshes_of_one_job_are_written_and_printed_one_by_one(
     assert [f"hu_001: {count:,} triangles, " in text for count in triangles] == [True, True]
 
 
-@pytest.mark.parametrize("spaced", [True, False])
+@pytest.mark.parametrize("is_spaced", [True, False], ids=["after a space", "after an equals sign"])
 def test_seed_with_a_negative_first_number_is_read_as_a_value(
-    spaced: bool, device: Any, ct: Path, tmp_path: Path, printed: Printer
+    is_spaced: bool, device: Any, ct: Path, tmp_path: Path, printed: Printer
 ) -> None:
     seeds = [",".join(f"{value:.3f}" for value in CENTRE + [0, 0, step]) for step in (0, RADIUS_MM)]
     assert seeds[0].startswith("-")
-    extra = [word for seed in seeds for word in (["--seed", seed] if spaced else [f"--seed={seed}"])]
+    extra = [word for seed in seeds for word in (["--seed", seed] if is_spaced else [f"--seed={seed}"])]
     arguments = ["mesh", str(ct), *extra, "-o", str(tmp_path / "a.stl"), "--json", "--device", str(device.index)]
     assert main([*arguments, "--hu", "-150"]) == 0
     report = printed().report()

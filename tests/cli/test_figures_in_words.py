@@ -36,7 +36,7 @@ def make_gap_runs(count: int) -> list[dict[str, Any]]:
 
 
 @pytest.mark.parametrize(
-    ("found", "words"),
+    ("gap_runs", "words"),
     [
         (make_gap_runs(2), "3 of 1, then 3 of 2 mm; SpacingBetweenSlices says 2"),
         (
@@ -47,8 +47,10 @@ def make_gap_runs(count: int) -> list[dict[str, Any]]:
         ([], "1 to 9 mm, usually 2; SpacingBetweenSlices says 2"),
     ],
 )
-def test_gaps_between_slices_are_listed_by_their_runs_up_to_a_number(found: list[dict[str, Any]], words: str) -> None:
-    of = {"gap_mm": {"min": 1.0, "max": 9.0, "median": 2.0}, "stated_gap_mm": 2.0, "gap_runs": found}
+def test_gaps_between_slices_are_listed_by_their_runs_up_to_a_number(
+    gap_runs: list[dict[str, Any]], words: str
+) -> None:
+    of = {"gap_mm": {"min": 1.0, "max": 9.0, "median": 2.0}, "stated_gap_mm": 2.0, "gap_runs": gap_runs}
     assert info._describe_gaps(of).startswith(words)
 
 

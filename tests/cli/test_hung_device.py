@@ -23,17 +23,17 @@ def command_line(command: str, device, tmp_path: Path) -> tuple[str, ...]:
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 @pytest.mark.parametrize(
-    ("command", "kernel", "number"),
+    ("command", "kernel", "sent_signal"),
     daily_rows(1, [("mesh", "emit_vertices", signal.SIGINT), ("render", "composite_rays", signal.SIGTERM)]),
 )
 def test_command_whose_kernel_hangs_is_ended_by_a_signal_with_130_and_leaves_nothing(
-    device, tmp_path, command, kernel, number
+    device, tmp_path, command, kernel, sent_signal
 ):
     process = start_command(kernel, *command_line(command, device, tmp_path))
     assert process.stderr is not None
     assert process.stderr.readline() == "the kernel spins\n"
     time.sleep(0.3)  # the command waits for it by now
-    process.send_signal(number)
+    process.send_signal(sent_signal)
     start = time.perf_counter()
     _, errors = process.communicate(timeout=60)
     assert time.perf_counter() - start < 12.0  # 0.6 s on an idle machine; the kernel spins for 30

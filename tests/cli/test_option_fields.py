@@ -56,17 +56,17 @@ def test_options_are_the_fields_of_their_settings_or_their_defaults(words: list[
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (["--even", "3"], "argument --even: 3 is odd (see: clrecon --help)"),
         (["--refused", "x"], "that says all"),
         (["--count", "x"], "argument --count: 'x' is no whole number (see: clrecon --help)"),
     ],
 )
-def test_value_that_cannot_be_read_is_refused_in_the_words_of_its_reader(words: list[str], said: str) -> None:
+def test_value_that_cannot_be_read_is_refused_in_the_words_of_its_reader(words: list[str], message: str) -> None:
     with pytest.raises(UsageError) as caught:
         parse(*words)
-    assert str(caught.value) == said
+    assert str(caught.value) == message
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -74,8 +74,8 @@ def test_letters_that_a_plain_locale_has_not_are_printed_as_codes(tmp_path: Path
 
 
 @pytest.mark.skipif(os.name != "posix", reason="pipes and signals of POSIX")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)])
-def test_interrupted_phantom_ends_with_130_and_leaves_no_files(number: signal.Signals, tmp_path: Path) -> None:
+@pytest.mark.parametrize("sent_signal", [signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)])
+def test_interrupted_phantom_ends_with_130_and_leaves_no_files(sent_signal: signal.Signals, tmp_path: Path) -> None:
     process = subprocess.Popen(
         [*COMMAND, "phantom", str(tmp_path / "ph"), "--slices", "300", "-v"],
         env=ENVIRONMENT,
@@ -85,7 +85,7 @@ def test_interrupted_phantom_ends_with_130_and_leaves_no_files(number: signal.Si
     )
     assert process.stderr is not None
     assert "drawing the phantom" in process.stderr.readline()
-    process.send_signal(number)
+    process.send_signal(sent_signal)
     output, errors = process.communicate(timeout=60)
     assert (process.returncode, output) == (130, "")
     assert errors == "clrecon: error: interrupted\n"

@@ -64,7 +64,7 @@ def test_range_and_iso_value_of_one_command_are_a_file_each(
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "words"),
     [
         ("100:", "'100:' is no range A:B of two numbers of HU; from A on is iso_value=A, below B is below=B"),
         (":300", "':300' is no range"),
@@ -72,14 +72,14 @@ def test_range_and_iso_value_of_one_command_are_a_file_each(
         ("100:b", "'b' in '100:b' is no number of HU"),
     ],
 )
-def test_text_that_is_no_range_is_refused(text: str, said: str) -> None:
+def test_text_that_is_no_range_is_refused(text: str, words: str) -> None:
     with pytest.raises(ValueError, match="is no") as caught:
         parse_hu(text)
-    assert said in str(caught.value)
+    assert words in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("settings", "said"),
+    ("settings", "words"),
     [
         ({"iso_value": ((300.0, 100.0),)}, "the range 300:100 HU holds nothing"),
         ({"iso_value": ((100.0, 300.0), (100.0, 300.0))}, "the iso value 100:300 HU is given twice"),
@@ -93,8 +93,8 @@ def test_text_that_is_no_range_is_refused(text: str, said: str) -> None:
         ({"keep_outside": True}, "only left out of what lies below"),
     ],
 )
-def test_range_or_level_below_with_a_setting_that_excludes_it_is_refused(settings: Any, said: str) -> None:
-    with pytest.raises(UsageError, match=said):
+def test_range_or_level_below_with_a_setting_that_excludes_it_is_refused(settings: Any, words: str) -> None:
+    with pytest.raises(UsageError, match=words):
         MeshSettings(**settings)
 
 

@@ -118,7 +118,7 @@ def test_an_affine_to_ras_has_its_first_two_rows_negated():
 
 
 @pytest.mark.parametrize(
-    ("affine", "says"),
+    ("affine", "words"),
     [
         (np.eye(3), "4x4"),
         (np.diag((1.0, 1.0, np.nan, 1.0)), "NaN"),
@@ -128,8 +128,8 @@ def test_an_affine_to_ras_has_its_first_two_rows_negated():
     ],
     ids=["3x3", "NaN", "no slice step", "two equal steps", "last row of 2"],
 )
-def test_a_matrix_that_places_no_voxels_is_refused(affine, says):
-    with pytest.raises(UsageError, match=says):
+def test_a_matrix_that_places_no_voxels_is_refused(affine, words):
+    with pytest.raises(UsageError, match=words):
         checked_affine(affine)
 
 

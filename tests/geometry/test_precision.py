@@ -18,10 +18,10 @@ from clrecon.geometry.vertices import (
 )
 
 
-def volume_from(x: float) -> Volume:
-    """3 x 3 x 3 voxels of 1 mm; with a layer around them they reach from x - 1 to x + 3."""
+def volume_from(x_mm: float) -> Volume:
+    """3 x 3 x 3 voxels of 1 mm; with a layer around them they reach from x_mm - 1 to x_mm + 3."""
     affine = np.eye(4)
-    affine[0, 3] = x
+    affine[0, 3] = x_mm
     return Volume(np.zeros((3, 3, 3), np.int16), affine)
 
 
@@ -33,23 +33,23 @@ FAR_WARNING = (
 )
 
 
-@pytest.mark.parametrize("x", NEAR + FAR)
-def test_the_largest_coordinate_of_a_volume_is_that_of_the_layer_around_it(x):
-    assert largest_coordinate(volume_from(x)) == max(abs(x - 1.0), abs(x + 3.0))
+@pytest.mark.parametrize("x_mm", NEAR + FAR)
+def test_the_largest_coordinate_of_a_volume_is_that_of_the_layer_around_it(x_mm):
+    assert largest_coordinate(volume_from(x_mm)) == max(abs(x_mm - 1.0), abs(x_mm + 3.0))
 
 
-@pytest.mark.parametrize("x", NEAR)
-def test_vertices_of_a_volume_within_4096_mm_count_from_the_origin_without_a_warning(x):
-    assert find_vertex_origin(volume_from(x)) is None
-    assert warnings_of_far(volume_from(x)) == []
+@pytest.mark.parametrize("x_mm", NEAR)
+def test_vertices_of_a_volume_within_4096_mm_count_from_the_origin_without_a_warning(x_mm):
+    assert find_vertex_origin(volume_from(x_mm)) is None
+    assert warnings_of_far(volume_from(x_mm)) == []
 
 
-@pytest.mark.parametrize("x", FAR)
-def test_vertices_of_a_volume_from_4096_mm_on_count_from_its_centre_with_a_warning(x):
-    origin = find_vertex_origin(volume_from(x))
+@pytest.mark.parametrize("x_mm", FAR)
+def test_vertices_of_a_volume_from_4096_mm_on_count_from_its_centre_with_a_warning(x_mm):
+    origin = find_vertex_origin(volume_from(x_mm))
     assert origin is not None
-    assert origin.tolist() == [x + 1.0, 1.0, 1.0]
-    assert warnings_of_far(volume_from(x)) == [FAR_WARNING]
+    assert origin.tolist() == [x_mm + 1.0, 1.0, 1.0]
+    assert warnings_of_far(volume_from(x_mm)) == [FAR_WARNING]
 
 
 @pytest.mark.parametrize(("y", "far"), [(4096.0, True), (-4096.0, True), (4095.5, False), (-4095.5, False)])

@@ -121,7 +121,7 @@ def test_other_voxels_of_another_shape_are_refused():
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "words"),
     [
         (lambda table: table[:-1], "5 slice positions for 6 slices"),
         (lambda table: table[[0, 2, 1, 3, 4, 5]], "from slice 1 to 2"),
@@ -130,9 +130,9 @@ def test_other_voxels_of_another_shape_are_refused():
     ],
     ids=["one missing", "two exchanged", "reversed", "NaN"],
 )
-def test_positions_that_do_not_advance_slice_by_slice_are_refused(change, says):
+def test_positions_that_do_not_advance_slice_by_slice_are_refused(change, words):
     affine = uneven().affine
-    with pytest.raises(UsageError, match=says):
+    with pytest.raises(UsageError, match=words):
         Volume(np.zeros((6, 5, 4), np.int16), affine, slice_positions=change(positions()))
 
 

@@ -81,7 +81,7 @@ def test_strided_voxels_are_made_contiguous():
 
 
 @pytest.mark.parametrize(
-    ("voxels", "says"),
+    ("voxels", "words"),
     [
         (np.zeros((3, 4)), "three axes"),
         (np.zeros((0, 3, 4)), "empty"),
@@ -93,8 +93,8 @@ def test_strided_voxels_are_made_contiguous():
     ],
     ids=["two axes", "no slice", "complex", "beyond 32 bits", "masked", "ragged", "beyond float32"],
 )
-def test_arrays_that_are_no_voxels_are_refused(voxels, says):
-    with pytest.raises(UsageError, match=says):
+def test_arrays_that_are_no_voxels_are_refused(voxels, words):
+    with pytest.raises(UsageError, match=words):
         Volume(voxels, np.eye(4))
 
 

@@ -57,9 +57,9 @@ BAD_TABLES = {
 }
 
 
-@pytest.mark.parametrize("what", BAD_TABLES)
-def test_bad_table_is_refused_with_what_is_wrong_and_where(what: str, tmp_path: Path) -> None:
-    text, facts = BAD_TABLES[what]
+@pytest.mark.parametrize("table", BAD_TABLES)
+def test_bad_table_is_refused_with_what_is_wrong_and_where(table: str, tmp_path: Path) -> None:
+    text, facts = BAD_TABLES[table]
     with refused(UsageError, *facts):
         read_table(tmp_path, text)
 
@@ -158,15 +158,15 @@ WRONG_OPTIONS = {
 }
 
 
-@pytest.mark.parametrize("what", WRONG_OPTIONS)
+@pytest.mark.parametrize("name", WRONG_OPTIONS)
 def test_wrong_option_is_refused_before_any_work(
-    what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Any
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Any
 ) -> None:
-    options, code, fact = WRONG_OPTIONS[what]
+    options, code, fact = WRONG_OPTIONS[name]
     monkeypatch.chdir(tmp_path)
     Path("m.csv").write_text("case,input\na,ct\n")
     assert main(["batch", "m.csv", "-o", "out", *options]) == code
-    told = printed()
-    told.assert_error(fact)
-    assert told.error_lines == 1
+    said = printed()
+    said.assert_error(fact)
+    assert said.error_lines == 1
     assert [path.name for path in tmp_path.iterdir()] == ["m.csv"]
