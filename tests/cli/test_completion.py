@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import argparse
 import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
+from command_lines import parser_of
 
 from clrecon.cli.completion import SHELLS, write_script
 from clrecon.cli.main import COMMANDS, main
@@ -60,14 +62,21 @@ def test_bash_offers_every_command_where_nothing_is_typed(bash_script: Path) -> 
     assert complete(bash_script, "clrecon", "") == [*COMMANDS, "help", "--help", "--version"]
 
 
+def options_of(command: str) -> list[str]:
+    """The long options of a command that its help shows."""
+    shown = [action for action in parser_of(command)._actions if action.help != argparse.SUPPRESS]
+    return [option for action in shown for option in action.option_strings if option.startswith("--")]
+
+
 @pytest.mark.parametrize("shell", SHELLS)
 def test_completion_script_names_all_commands_and_options(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["completion", shell]) == 0
 
     printed = capsys.readouterr()
     dashes = "-l " if shell == "fish" else "--"
-    some_options = [f"{dashes}{option}" for option in ("keep-largest", "transfer-function", "json")]
-    assert [word for word in (*COMMANDS, *some_options, "cortical-bone") if word not in printed.out] == []
+    options = {f"{dashes}{option[2:]}" for command in COMMANDS for option in options_of(command)}
+    assert len(options) > 100  # the parsers have options
+    assert [word for word in (*COMMANDS, *options, "cortical-bone") if word not in printed.out] == []
     assert printed.err == ""
 
 

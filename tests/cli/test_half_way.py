@@ -41,7 +41,7 @@ def test_words_of_auto_have_the_iso_value_and_the_materials_it_lies_half_way_bet
     assert "HU (auto: half way between tissue 0 and bone 700 HU), closed" in line
 
 
-def test_half_of_two_given_materials_is_reported_with_a_warning_where_the_scan_has_not_one(
+def test_half_of_two_given_materials_is_reported_with_a_warning_where_one_is_not_in_the_scan(
     ct: Path, device: Any, tmp_path: Path, printed: Printer
 ) -> None:
     assert run_mesh(ct, device, tmp_path, "--hu", "half:700,-100", "--json") == 0

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 import shlex
-from importlib import import_module
 
 import pytest
-from command_lines import parse_command
+from command_lines import parse_command, parser_of
 
-from clrecon.cli.common import SCREEN_LINES, Parser, add_common
+from clrecon.cli.common import SCREEN_LINES
 from clrecon.cli.main import COMMANDS, main
 
 SCREEN_COLUMNS = 100
@@ -19,13 +18,6 @@ SCREEN_COLUMNS = 100
 def screen(monkeypatch: pytest.MonkeyPatch) -> None:
     """A terminal of `SCREEN_COLUMNS`."""
     monkeypatch.setenv("COLUMNS", str(SCREEN_COLUMNS))
-
-
-def parser_of(command: str) -> Parser:
-    parser = Parser(prog=f"clrecon {command}")
-    import_module(COMMANDS[command].module).add_arguments(parser)
-    add_common(parser)
-    return parser
 
 
 def help_of(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import argparse
 import gettext
 from collections.abc import Iterator
-from importlib import import_module
 from pathlib import Path
 
 import pytest
+from command_lines import parser_of
 from variants import FOR_RELEASE
 
-from clrecon.cli.common import Parser, add_common
-from clrecon.cli.main import COMMANDS, main
+from clrecon.cli.common import Parser
+from clrecon.cli.main import main
 
 NINES = "9" * 400
 ODD = (
@@ -39,10 +39,8 @@ BESIDE = {"--grow": "--labels={there}/a.nii", "--frames": _MOVIE, "--fps": _MOVI
 
 
 def list_options(command: str) -> Iterator[argparse.Action]:
-    parser = Parser(prog=command)
-    import_module(COMMANDS[command].module).add_arguments(parser)
-    add_common(parser)
-    yield from (action for action in parser._actions if action.option_strings and action.nargs != 0)
+    actions = parser_of(command)._actions
+    yield from (action for action in actions if action.option_strings and action.nargs != 0)
 
 
 OPTIONS = [(command, action) for command in INPUTS for action in list_options(command)]

@@ -136,7 +136,7 @@ def test_positions_that_do_not_advance_slice_by_slice_are_refused(change, words)
         Volume(np.zeros((6, 5, 4), np.int16), affine, slice_positions=change(positions()))
 
 
-def test_repr_of_an_uneven_volume_says_so_with_its_size_type_and_spacing():
+def test_repr_of_an_uneven_volume_has_its_size_type_and_spacing_and_names_uneven_slices():
     volume = uneven(np.zeros((6, 5, 4), np.int16))
     _, _, dk = volume.spacing
     assert repr(volume) == f"Volume(4 x 5 x 6 int16, spacing 0.5 x 0.7 x {dk:.3f} mm, uneven slices)"

@@ -6,13 +6,13 @@ import ast
 import inspect
 import re
 from functools import cache
-from importlib import import_module
 
 import pytest
+from command_lines import parser_of
 from house import PACKAGE, ROOT
 
 import clrecon
-from clrecon.cli.common import Parser, add_common, speaker_of
+from clrecon.cli.common import speaker_of
 from clrecon.cli.main import COMMANDS
 from clrecon.jobs.batch.plan import BatchSettings
 from clrecon.jobs.cloud.settings import CloudSettings
@@ -25,13 +25,6 @@ from clrecon.system.arguments import _DESTINATIONS, in_python, name_parameter, s
 from clrecon.viewer.web.server import serve_view
 
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
-
-
-def parser_of(command: str) -> Parser:
-    parser = Parser(prog=command)
-    import_module(COMMANDS[command].module).add_arguments(parser)
-    add_common(parser)
-    return parser
 
 
 def find_options(source: str) -> list[str]:

@@ -4,13 +4,27 @@ from __future__ import annotations
 
 from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from printed_text import Printer
+
+if TYPE_CHECKING:
+    from clrecon.cli.common import Parser
+
+
+def parser_of(command: str) -> Parser:
+    """The parser of a command, as clrecon makes it."""
+    from clrecon.cli.common import Parser, add_common
+    from clrecon.cli.main import COMMANDS
+
+    parser = Parser(prog=command)
+    import_module(COMMANDS[command].module).add_arguments(parser)
+    add_common(parser)
+    return parser
 
 
 def parse_command(arguments: list[str]) -> None:
     """Parse `arguments` as clrecon would."""
-    from clrecon.cli.common import Parser, add_common
     from clrecon.cli.main import COMMANDS
     from clrecon.errors import UsageError
 
@@ -18,10 +32,7 @@ def parse_command(arguments: list[str]) -> None:
         return
     if arguments[0] not in COMMANDS:
         raise UsageError(f"no command {arguments[0]}")
-    parser = Parser(prog=arguments[0])
-    import_module(COMMANDS[arguments[0]].module).add_arguments(parser)
-    add_common(parser)
-    parser.parse_args(arguments[1:])
+    parser_of(arguments[0]).parse_args(arguments[1:])
 
 
 def check_refused(arguments: list[str], code: int, fact: str | float, folder: Path, printed: Printer) -> None:
