@@ -26,7 +26,7 @@ def test_timed_command_is_understood_up_to_its_missing_input(
 
 
 def test_command_of_more_than_5_s_stands_out() -> None:
-    assert "over 5 s" in outliers.judge(run_of(cpu_s=5.1), None)
+    assert "over 5 s" in outliers.judge(run_of(cpu_s=5.1), peer=None)
 
 
 def test_command_of_more_than_three_times_its_peer_stands_out_with_the_factor() -> None:

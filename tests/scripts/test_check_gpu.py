@@ -61,7 +61,7 @@ def test_array_with_indices_known_at_run_time_alone_raises_the_stack_above_its_r
 def test_more_numbers_at_once_than_registers_are_found_to_spill(tmp_path: Path) -> None:
     registers_of_gfx1030, more = 256, 44
     figures = compile_kernel("gfx1030", many_values(registers_of_gfx1030 + more), tmp_path)
-    assert any("run spills" in fault for fault in check_gpu.compare(figures, None))
+    assert any("run spills" in fault for fault in check_gpu.compare(figures, recorded=None))
 
 
 @pytest.mark.parametrize(

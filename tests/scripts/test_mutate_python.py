@@ -300,7 +300,7 @@ def test_process_that_forks_for_tests_has_imported_the_libraries_and_no_module_o
         "def test_it():\n    assert 'colorsys' in LOADED and 'wave' not in LOADED\n"
     )
     test = "tests/flat/test_warm.py::test_it"
-    warm = WarmTests(copy.root, copy.environment(False), ["colorsys", "no_such_module"])
+    warm = WarmTests(copy.root, copy.environment(writes_bytecode=False), ["colorsys", "no_such_module"])
     allowed_s = 60.0  # of processor time
     output = tmp_path / "said.txt"
     run = Run(stages=[[test]], cpu_s=[allowed_s], wall_s=600.0, folder=str(tmp_path / "tests"), said=str(output))
@@ -395,7 +395,11 @@ def test_kernels_that_tests_of_a_copy_load_are_those_of_the_copy(tmp_path: Path)
     made = Copy.make(tmp_path / "project", tmp_path)
     program = "from importlib import resources; print(resources.files('clrecon.cl').joinpath('own.cl').read_text())"
     said = subprocess.run(
-        [sys.executable, "-c", program], cwd=made.root, env=made.environment(False), capture_output=True, text=True
+        [sys.executable, "-c", program],
+        cwd=made.root,
+        env=made.environment(writes_bytecode=False),
+        capture_output=True,
+        text=True,
     )
     assert said.stdout == "own\n", said.stderr
 

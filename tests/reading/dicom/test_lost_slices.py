@@ -99,7 +99,7 @@ OTHER_SERIES = pytest.mark.parametrize(
 )
 
 
-def write_beside_other_series(folder, change):
+def write_beside_other_series(folder, change=None):
     """A series of 7 slices, and in a folder beside it another series of 3 with a corrupt file."""
     plan = write_series(folder / "ct", Plan(shape=(7, 5, 6)))
     write_series(folder / "other", Plan(series=2, shape=(3, 5, 6)), change)
@@ -117,7 +117,7 @@ def test_corrupt_file_among_slices_of_another_series_is_skipped_with_a_warning(t
 
 
 def test_corrupt_file_among_slices_of_a_series_refuses_that_series(tmp_path):
-    write_beside_other_series(tmp_path, None)
+    write_beside_other_series(tmp_path)
     assert_series_refused(tmp_path, "bad: ", number=2)
 
 

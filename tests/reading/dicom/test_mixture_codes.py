@@ -90,7 +90,7 @@ def test_elements_that_differ_in_every_series_are_never_judged():
     ],
 )
 def test_alternating_element_has_its_verdict_in_even_and_uneven_stacks(tag, even, uneven):
-    assert (find_verdict(tag, True), find_verdict(tag, False)) == (even, uneven)
+    assert (find_verdict(tag, even=True), find_verdict(tag, even=False)) == (even, uneven)
 
 
 def test_order_of_values_alternates_where_it_repeats_three_times():

@@ -13,6 +13,14 @@ from clrecon.errors import RefusedInputError
 from clrecon.reading import read_volume
 
 
+def put_padding_value(ds, vr, raw):
+    """Give a data set the element PixelPaddingValue with these bytes, in explicit VR."""
+    tag = Tag("PixelPaddingValue")
+    ds[tag] = RawDataElement(
+        tag, vr, length=len(raw), value=raw, value_tell=0, is_implicit_VR=False, is_little_endian=True
+    )
+
+
 @pytest.mark.parametrize(
     ("bits", "vr", "raw", "stored"),
     [
@@ -31,8 +39,7 @@ def test_padding_is_masked_in_any_width_and_sign_of_its_value(tmp_path, bits, vr
         array = plan.stored(k).astype(np.uint16) & ((1 << bits) - 1)
         array[0, :3] = stored
         set_values(BitsStored=bits, HighBit=bits - 1, PixelData=array.astype(np.uint16).tobytes())(ds, k)
-        tag = Tag("PixelPaddingValue")
-        ds[tag] = RawDataElement(tag, vr, len(raw), raw, 0, False, True)
+        put_padding_value(ds, vr, raw)
 
     plan = Plan()
     write_series(tmp_path, plan, change)
@@ -48,8 +55,7 @@ def test_padding_is_masked_in_any_width_and_sign_of_its_value(tmp_path, bits, vr
 )
 def test_padding_value_that_is_no_binary_number_is_refused(tmp_path, vr, raw):
     def change(ds, k):
-        tag = Tag("PixelPaddingValue")
-        ds[tag] = RawDataElement(tag, vr, len(raw), raw, 0, False, True)
+        put_padding_value(ds, vr, raw)
 
     write_series(tmp_path, change=change)
     with refused(RefusedInputError, "PixelPaddingValue", "number"):

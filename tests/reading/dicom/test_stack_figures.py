@@ -207,17 +207,17 @@ def test_values_of_more_than_64_bytes_are_compared_by_a_hash():
     assert len(_shorten(b"a" * 65)) == 8 + len("...")
 
 
-def part(number: int, first: int | None, frames: int = 10, parts: int | None = 3) -> Any:
+def part(number: int, *, first: int | None, parts: int | None = 3) -> Any:
     """A file of a concatenation: part `number`, of 10 frames, the first of which is `first`, from 0."""
-    return SimpleNamespace(concatenation=Concatenation("1.2", number, parts, first, frames))
+    return SimpleNamespace(concatenation=Concatenation("1.2", number, parts, first, 10))
 
 
 @pytest.mark.parametrize(
     "parts",
     [
-        [part(1, 0), part(2, 10), part(3, 20), part(3, 20)],
-        [part(1, None), part(2, None), part(3, None)],
-        [part(1, 0), part(2, None), part(3, 21)],
+        [part(1, first=0), part(2, first=10), part(3, first=20), part(3, first=20)],
+        [part(1, first=None), part(2, first=None), part(3, first=None)],
+        [part(1, first=0), part(2, first=None), part(3, first=21)],
         [SimpleNamespace(concatenation=None)],
     ],
     ids=["one part twice", "no starts", "the end of part 2 is not known", "no concatenation"],
@@ -227,7 +227,7 @@ def test_concatenation_that_may_be_whole_has_no_missing_parts(parts: list[Any]) 
 
 
 def test_parts_of_a_concatenation_that_start_at_other_frames_than_the_last_ended_are_described():
-    assert describe_missing_parts([part(3, 20), part(1, 0), part(2, 11)]) == [
+    assert describe_missing_parts([part(3, first=20), part(1, first=0), part(2, first=11)]) == [
         "file 2 of a concatenation starts at frame 11, the one before it ends at frame 10 "
         "(ConcatenationFrameOffsetNumber (0020,9228))",
         "file 3 of a concatenation starts at frame 20, the one before it ends at frame 21 "
@@ -238,8 +238,11 @@ def test_parts_of_a_concatenation_that_start_at_other_frames_than_the_last_ended
 @pytest.mark.parametrize(
     ("parts", "missing"),
     [
-        ([part(1, 0), part(3, 20)], "file 2 of the 3 of a concatenation is missing"),
-        ([part(2, 10, parts=None), part(4, 30, parts=None)], "files 1, 3 of the 4 of a concatenation are missing"),
+        ([part(1, first=0), part(3, first=20)], "file 2 of the 3 of a concatenation is missing"),
+        (
+            [part(2, first=10, parts=None), part(4, first=30, parts=None)],
+            "files 1, 3 of the 4 of a concatenation are missing",
+        ),
     ],
     ids=["of a known number", "up to the last that is there"],
 )
@@ -409,7 +412,7 @@ def test_bit_above_the_stored_ones_is_stray_unless_an_overlay_is_in_it(overlays,
     header: Any = SimpleNamespace(
         bits_allocated=16, bits_stored=12, high_bit=11, signed=True, float_pixels=False, file="a", little_endian=True
     )
-    assert stray_bits.find_stray_bits(header, np.array([[-1, 4101]], np.int16), None) == expected
+    assert stray_bits.find_stray_bits(header, np.array([[-1, 4101]], np.int16), left_out=None) == expected
 
 
 def slices_in_steps_below_the_tolerance():

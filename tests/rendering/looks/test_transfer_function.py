@@ -167,7 +167,7 @@ def test_window_is_a_ramp_of_grey_and_opacity_between_its_ends(ends: tuple[float
 
 def test_window_without_a_width_is_refused() -> None:
     with refused(UsageError, "HU", 5):
-        TransferFunction.from_window(5, 5)
+        TransferFunction.from_window(low=5, high=5)
 
 
 def test_transfer_functions_with_the_same_points_are_equal_whatever_their_names() -> None:

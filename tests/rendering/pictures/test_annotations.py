@@ -42,7 +42,12 @@ def test_letters_of_the_views_are_those_of_the_patient(view, letters):
 
 
 def test_letters_of_an_oblique_view_name_two_and_three_sides():
-    assert edge_letters(PARALLEL.orbit(30.0, 20.0)) == {"left": "RA", "right": "LP", "top": "SPR", "bottom": "IAL"}
+    assert edge_letters(PARALLEL.orbit(azimuth=30.0, elevation=20.0)) == {
+        "left": "RA",
+        "right": "LP",
+        "top": "SPR",
+        "bottom": "IAL",
+    }
 
 
 @pytest.mark.parametrize(

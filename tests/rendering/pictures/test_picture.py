@@ -70,7 +70,7 @@ def test_pixels_too_small_or_large_for_the_resolution_of_png_are_saved_without_i
 
 
 def test_png_names_its_software_mode_view_pixel_and_camera(tmp_path):
-    make_picture(camera=PARALLEL.orbit(30.0, 10.0)).save(tmp_path / "a.png")
+    make_picture(camera=PARALLEL.orbit(azimuth=30.0, elevation=10.0)).save(tmp_path / "a.png")
     with Image.open(tmp_path / "a.png") as read:
         text = read.text
     assert text["Software"].startswith("clrecon ")

@@ -33,7 +33,7 @@ def helix(t):
 @pytest.fixture(scope="module")
 def third_of_a_circle() -> Curve:
     """A curve through points 14 mm apart on a third of a circle."""
-    return Curve(arc_points(TURN_DEG, 13))
+    return Curve(arc_points(TURN_DEG, count=13))
 
 
 def test_curve_of_a_circle_is_as_long_as_its_arc(third_of_a_circle):
@@ -54,7 +54,7 @@ def test_smallest_radius_of_a_circle_is_its_radius(third_of_a_circle):
 def test_curve_begins_and_ends_at_its_end_points(third_of_a_circle):
     ends = third_of_a_circle.at([0.0, third_of_a_circle.length])
 
-    assert ends == pytest.approx(arc_points(TURN_DEG, 13)[[0, -1]])
+    assert ends == pytest.approx(arc_points(TURN_DEG, count=13)[[0, -1]])
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +127,7 @@ def test_half_the_step_of_frames_leaves_a_sixteenth_of_their_error():
 
 
 def test_normals_across_a_plane_curve_stay_across_it():
-    curve = Curve(arc_points(150.0, 20))
+    curve = Curve(arc_points(150.0, count=20))
     arc = np.linspace(0.0, curve.length, 300)
 
     normals = rotation_minimising_normals(curve.at(arc), curve.tangents(arc), (1.0, 0.0, 0.0))
