@@ -161,7 +161,7 @@ def test_a_wall_has_130_hu_and_is_60_hu_denser_than_what_lies_beyond(wall: float
 @WALLS
 def test_a_wall_in_front_alone_lies_in_12_of_18_directions(wall: float, beyond: float, share: float) -> None:
     page = ring(wall, beyond)
-    page[:20] = 70.0  # behind the middle; directions lie between -130 and 130 degrees from the front
+    page[:20] = 70.0  # behind the middle; directions are -130, -115 ... 125 degrees from the front
     walls = _walls(np.repeat(page[None], PLACES, axis=0), BODY_OF_40_MM, WHOLE)
     assert walls == pytest.approx(share * 12 / 18)
 

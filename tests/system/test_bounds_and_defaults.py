@@ -132,16 +132,16 @@ def test_temporary_folder_is_for_its_owner_alone_and_removed_with_its_files(tmp_
 @pytest.mark.parametrize(("name", "fact"), [("a", "extension"), ("a.plx", ".plx")])
 def test_missing_or_unknown_extension_is_refused_with_the_known_ones(name: str, fact: str) -> None:
     with refused(UsageError, fact, ".ply", ".stl"):
-        find_extension(name, (".ply", ".stl"), "mesh")
+        find_extension(name, (".ply", ".stl"), noun="mesh")
 
 
 def test_name_that_is_only_an_extension_is_refused_with_it() -> None:
     with refused(UsageError, "only", ".ply"):
-        find_extension(".ply", (".ply", ".stl"), "mesh")
+        find_extension(".ply", (".ply", ".stl"), noun="mesh")
 
 
 def test_extension_in_capitals_is_found() -> None:
-    assert find_extension("A.PLY", (".ply", ".stl"), "mesh") == ".ply"
+    assert find_extension("A.PLY", (".ply", ".stl"), noun="mesh") == ".ply"
 
 
 def test_file_is_read_up_to_its_largest_size_and_refused_a_byte_above(tmp_path: Path) -> None:

@@ -65,7 +65,7 @@ def test_new_file_is_verified_whole_under_a_temporary_private_name_before_it_app
         assert stat.S_IMODE(temporary.stat().st_mode) == 0o600
         assert not target.exists()
 
-    replace_file(target, lambda stream: stream.write(b"12345"), verify)
+    replace_file(target, lambda stream: stream.write(b"12345"), verify=verify)
 
     [temporary] = verified
     assert temporary.parent == tmp_path
@@ -149,7 +149,7 @@ def test_interrupt_while_verifying_leaves_the_older_file(older):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        replace_file(older, lambda stream: stream.write(b"newer"), interrupt)
+        replace_file(older, lambda stream: stream.write(b"newer"), verify=interrupt)
     check_untouched(older)
 
 
@@ -158,7 +158,7 @@ def test_file_that_fails_its_verification_leaves_the_older_file(older):
         raise OutputError("3 triangles, 4 expected")
 
     with refused(OutputError, "triangles", 3, 4):
-        replace_file(older, lambda stream: stream.write(b"newer"), find_fault)
+        replace_file(older, lambda stream: stream.write(b"newer"), verify=find_fault)
     check_untouched(older)
 
 

@@ -63,7 +63,7 @@ def test_volume_in_a_notebook_is_pictures_of_three_slices(device):
 
 @pytest.mark.opencl
 def test_volume_in_a_notebook_has_a_table_of_its_certificate(device):
-    volume = Volume(VOLUME.voxels, VOLUME.affine, {"tilt_deg": 12.5})
+    volume = Volume(VOLUME.voxels, VOLUME.affine, report={"tilt_deg": 12.5})
 
     ((heads, *rows),) = PageCheck(volume._repr_html_()).tables
 

@@ -395,9 +395,9 @@ def test_picture_of_a_scan_in_slabs_is_that_of_the_whole(device):
     model = ViewModel(objects, iso_value=scenes.ISO)
     memory = 80_000  # bytes, of which the voxels alone would take 77,440
     with Painter(objects, device=device) as whole, Painter(objects, device=device, memory=memory) as slabs:
-        pictures = [each.picture(model.state, (24, 20)) for each in (whole, slabs)]
-        assert pictures[1].report["slabs"] > 1
-        assert np.array_equal(pictures[0].image, pictures[1].image)
+        of_whole, of_slabs = (each.picture(model.state, (24, 20)) for each in (whole, slabs))
+        assert of_slabs.report["slabs"] > 1
+        assert np.array_equal(of_whole.image, of_slabs.image)
 
 
 @pytest.mark.release

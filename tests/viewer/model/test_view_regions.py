@@ -113,7 +113,7 @@ def test_region_in_an_uneven_stack_takes_the_layer_that_lies_nearest() -> None:
 
     measure = measure_region(volume, "box", points)
 
-    check_values(measure, volume.voxels[5, 3:11, 2:10].ravel().astype(float))
+    check_values(measure, volume.voxels[5, 3:11, 2:10].ravel().astype(float))  # at 8 mm
 
 
 def draw(model, tool: str, first, second, axes=(X, -Y)):
