@@ -43,21 +43,31 @@ from clrecon.system.records import at_most
 VOXELS = np.arange(4 * 5 * 6, dtype=np.int16).reshape(4, 5, 6)
 AFFINE = np.array([[0.7, 0.1, 0.0, -25.0], [-0.1, 0.7, 0.2, -30.0], [0.0, 0.05, 2.5, -84.0], [0, 0, 0, 1.0]])
 POSITIONS = np.array([[0, 0, 0], [0, 0, 2], [0, 0, 5], [0, 0, 9.0]])
-TRIANGLE = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], [[0, 0, 1.0]] * 3, {"iso_value_hu": 250.0})
+TRIANGLE = Mesh(
+    [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], normals=[[0, 0, 1.0]] * 3, report={"iso_value_hu": 250.0}
+)
 LABELS = LabelMap(VOXELS > 50, AFFINE, {1: "bone"}, warnings=["doubtful"])
 CAMERA = Camera.fit(Volume(VOXELS, AFFINE))
 CURVE = Curve([[0, 0, 0], [1, 2, 3], [2, 2, 7.0]])
-ENTRY = SeriesEntry(1, "ab", "thin", "CT", 4, [6, 5, 4], [1.0] * 3, None, 0.0, 0.0, {"min": 1.0}, False, [], [])
+ENTRY = SeriesEntry(
+    number=1, uid_hash="ab", description="thin", modality="CT", slices=4, shape_ijk=[6, 5, 4], spacing_mm=[1.0] * 3,
+    affine_ijk_to_lps_mm=None, tilt_deg=0.0, grid_residual_max_mm=0.0, gap_mm={"min": 1.0}, uneven=False, warnings=[],
+    problems=[],
+)  # fmt: skip
 EMPTY = np.zeros((2, 3), np.float32)
 CLOUD = PointCloud([[0, 0, 0], [1, 2, 3]], hu=[200, 300], labels=[0, -1], report={"iso_value_hu": 250.0})
 
-VERTEBRA = Vertebra(1, "vertebra_1", 0.4, False, ["shallow disc"], True, [0.0, 1.0, 2.0], 30.0, 40.0)
+VERTEBRA = Vertebra(
+    number=1, name="vertebra_1", confidence=0.4, is_confident=False, doubts=["shallow disc"], whole=True,
+    centre_mm=[0.0, 1.0, 2.0], height_mm=30.0, volume_ml=40.0,
+)  # fmt: skip
 PLANE = MiddlePlane(
-    EMPTY, EMPTY, EMPTY.astype(np.int32), EMPTY.astype(np.int32), 1, 2, [((0.0, 1.0), (2.0, 3.0))], [0.5]
-)
+    sagittal=EMPTY, coronal=EMPTY, sagittal_labels=EMPTY.astype(np.int32), coronal_labels=EMPTY.astype(np.int32),
+    canal_column=1, middle_column=2, lines=[((0.0, 1.0), (2.0, 3.0))], rows=[0.5],
+)  # fmt: skip
 
 MESSAGES = {  # whatever they contain: it is compared with itself
-    "volume": Volume(VOXELS, AFFINE, {"warnings": ["doubtful"]}),
+    "volume": Volume(VOXELS, AFFINE, report={"warnings": ["doubtful"]}),
     "uneven volume": Volume(VOXELS, AFFINE, slice_positions=POSITIONS),
     "mesh": TRIANGLE,
     "label map": LABELS,
@@ -81,23 +91,35 @@ MESSAGES = {  # whatever they contain: it is compared with itself
     "plane cut": PlaneCut(thickness=3.0),
     "curve cut": CurveCut(CURVE, kind="stretched"),
     "phantom settings": PhantomSettings(),
-    "iso choice": half_iso_value(1000.0, 40.0),
+    "iso choice": half_iso_value(bone_hu=1000.0, tissue_hu=40.0),
     "grid cells": GridCells([[0, -1, 2], [3, 4, 5]], "t-mc"),
     "vertebra": VERTEBRA,
     "middle plane": PLANE,
-    "vertebra split": VertebraSplit(LABELS, [VERTEBRA], CURVE.points, CURVE.points, 150.0, ["a sacrum"], PLANE),
+    "vertebra split": VertebraSplit(
+        LABELS,
+        [VERTEBRA],
+        discs_mm=CURVE.points,
+        disc_normals=CURVE.points,
+        level_hu=150.0,
+        left_out=["a sacrum"],
+        plane=PLANE,
+    ),
     "gate": at_most("gap", 1.0, bound=2.0, unit="mm", subject="a gap"),
     "quality": TRIANGLE.quality(),
     "point cloud": CLOUD,
-    "point step": PointStep(CLOUD, np.array([0, 1, 0], np.uint8), ("noise",), {"eps_mm": 1.2}, ("doubtful",)),
+    "point step": PointStep(
+        CLOUD, removed=np.array([0, 1, 0], np.uint8), reasons=("noise",), facts={"eps_mm": 1.2}, warnings=("doubtful",)
+    ),
     "clusters": Clustering(CLOUD, np.zeros(2, np.uint8), cores=np.array([True, False])),
     "nearest points": Neighbours(np.zeros((2, 1), np.int32), np.zeros((2, 1), np.float32)),
-    "noise": Noise(12.5, 40, 9),
+    "noise": Noise(hu=12.5, blocks=40, slices=9),
     "truth of a phantom": phantom_truth(PhantomSettings(kind="sphere", size=(16, 16), slices=16)),
     "mesh look": MeshLook(vertex_colors=np.zeros((2, 3), np.uint8), opacity=0.5),
     "point look": PointLook(radius_mm=0.5, color_by="label"),
     "figures of a label": measure_labels(Volume(VOXELS, AFFINE), LABELS)[0],
-    "listing": SeriesListing([ENTRY], 1, {}, [], {"slices": 4}, RefusedInputError("no")),
+    "listing": SeriesListing(
+        [ENTRY], chosen=1, skipped={}, warnings=[], certificate={"slices": 4}, refusal=RefusedInputError("no")
+    ),
 }
 HELD_BY_A_DEVICE = {"Device", "DeviceVolume", "Mask", "SurfaceExtractor", "VertebraInside", "VolumeRenderer"}
 """Public classes that are no messages: they own memory of a device."""
