@@ -55,6 +55,6 @@ def test_surface_of_a_file_of_a_gigabyte_is_made_within_a_few_times_the_memory_a
     assert result["closed"]
     assert result["components"] == 2
     radius_mm = 0.2 * (50 + 0.5 / 10)  # the level is 499.5 HU, which fall by 10 a voxel
-    assert result["volume_ml"] == pytest.approx(2 * 4 / 3 * np.pi * radius_mm**3 / 1000, rel=1e-3)  # measured 3e-5
+    assert result["volume_ml"] == pytest.approx(2 * 4 / 3 * np.pi * radius_mm**3 / 1000, rel=1e-4)  # measured 3e-5
     copies = 2 if device.shares_host_memory else 4  # llvmpipe's own memory, and what goes there, are the computer's too
     assert result["grown_mib"] < copies * BUDGET / 2**20  # measured 114, less than one

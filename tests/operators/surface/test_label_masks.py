@@ -107,7 +107,7 @@ def test_levels_of_a_body_within_another_are_those_of_the_twin(device):
 def test_survey_of_labels_finds_the_boxes_and_faces_of_their_voxels(device, memory):
     labels = random_labels((7, 9, 70), seed=3, numbers=(0, 0, 0, 0, 0, 2, 5, 6))
     boxes, faces = survey_labels(LabelMap(labels, np.eye(4)), device, memory, Stopwatch())
-    assert boxes == find_boxes(labels, (2, 5, 6), (0, 0, 0))
+    assert boxes == find_boxes(labels, (2, 5, 6), reach=(0, 0, 0))
     assert faces.tolist() == count_faces(labels).tolist()
 
 
@@ -116,7 +116,7 @@ def test_survey_of_a_single_label_finds_its_box_and_counts_no_faces(device, memo
     """They say which labels touch: there is no other."""
     labels = random_labels((5, 6, 40), numbers=(0, 0, 4))
     boxes, faces = survey_labels(LabelMap(labels, np.eye(4)), device, memory, Stopwatch())
-    assert boxes == find_boxes(labels, (4,), (0, 0, 0))
+    assert boxes == find_boxes(labels, (4,), reach=(0, 0, 0))
     assert faces.tolist() == [[0, 0]] * 5  # of each number up to 4
 
 

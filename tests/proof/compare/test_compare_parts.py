@@ -98,7 +98,7 @@ def test_peers_lie_where_the_scan_is_and_face_outward(name: str, affine: Any, de
     quality = peer.quality()
     assert (quality.closed, quality.outward) == (True, True)
     assert quality.volume_ml == pytest.approx(own.quality().volume_ml, rel=1e-5)  # float32; measured 2.4e-6
-    assert clrecon.compare_meshes(peer, own).hd95_mm < 0.05  # measured 0.0014
+    assert clrecon.compare_meshes(peer, own).hd95_mm < 0.003  # measured 0.0014
     cells = (32 + 1) * (30 + 1) * (28 + 1)  # of the voxels and a border
     assert peer.report["cells"] == {"visited": cells, "all": cells}
 
@@ -180,7 +180,7 @@ def test_reference_is_measured_as_equal_to_itself(judge: Judge) -> None:
     reference = judge.measure("t-mc")
     assert (reference["reasons"], reference["truth"], reference["points"]) == ({}, None, None)
     assert reference["cells"]["dice"] == 1.0
-    assert reference["surfaces"]["max_mm"] < 1e-4  # rounding of distances in float64: measured 2e-12
+    assert reference["surfaces"]["max_mm"] < 1e-9  # rounding of distances in float64: measured 2e-12
     # the mesh against trilinear HU on a finer lattice than the voxels: measured 0.9994
     assert reference["slices"]["dice"] > 0.998
     assert reference["slices"]["voxel_dice"] == 1.0
@@ -196,7 +196,7 @@ def test_half_of_a_mesh_is_measured_as_open_and_incomplete(judge: Judge) -> None
 
 def test_cloud_is_measured_by_its_distance_from_the_reference(judge: Judge) -> None:
     cloud = judge.measure("cloud")
-    assert cloud["points"]["to_reference_mm"]["max"] == pytest.approx(50.0, abs=1e-4)  # float32; measured 8e-6
+    assert cloud["points"]["to_reference_mm"]["max"] == pytest.approx(50.0, abs=2e-5)  # float32; measured 8e-6
     assert (cloud["points"]["bias_mm"], cloud["slices"]) == (None, None)
 
 
