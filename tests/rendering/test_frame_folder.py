@@ -21,6 +21,7 @@ STALE = ".clrecon-0123456789abcdef.folder"
 
 
 def frames(count: int = 2) -> list[np.ndarray]:
+    """Even pictures of 8 x 8 pixels, each lighter than the one before."""
     return [np.full((8, 8, 3), 100 * number, np.uint8) for number in range(count)]
 
 

@@ -304,6 +304,7 @@ def test_frames_of_an_animation_are_asked_for_one_by_one_with_their_progress(tmp
 
 
 def never():
+    """Frames that must not be asked for."""
     raise AssertionError("a frame was computed")
     yield
 

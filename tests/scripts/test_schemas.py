@@ -33,6 +33,7 @@ Each of `parts`:
 
 
 def schema_of(contract: str) -> Any:
+    """The schema of the report that a contract describes."""
     return make_schemas.make_schema(make_schemas.read_sections(contract)["weigh"])
 
 

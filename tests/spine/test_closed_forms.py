@@ -20,6 +20,7 @@ def straight_course(places: int, reaches: tuple[bool, bool] = (False, False)) ->
 
 
 def looks_of_depth(depth: np.ndarray) -> Looks:
+    """What planes look like that are darker by `depth` (places, tilts) HU, in bodies of 20 mm."""
     mm = np.full(len(depth), 20.0)
     return Looks(depth, depth, depth, mm, mm, mm)
 
@@ -154,6 +155,7 @@ def ramp_bone() -> Any:
 
 
 def measure_ramp_bias(bone: Any) -> Any:
+    """The bias along the line from `START` to `END`, in a frame that is that of LPS."""
     return measures.measure_bias(bone, SimpleNamespace(to_lps=lambda points: points), START, END)  # type: ignore[arg-type]
 
 

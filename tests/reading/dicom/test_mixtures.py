@@ -199,6 +199,7 @@ def failed_gates(report):
 
 
 def values_of_both(elements):
+    """The elements of the first volume and those of the second."""
     return [{keyword: value(number) for keyword, value in elements.items()} for number in (0, 1)]
 
 

@@ -20,6 +20,7 @@ SAID = "Modality LUT Sequence (0028,3000), which is not applied: slope 1, interc
 
 
 def measure_hu_known(path, **options):
+    """How many slices fail the gate hu_known, and the warnings of Modality LUTs."""
     report = read_volume(path, **options).report
     (known,) = (gate for gate in report["gates"] if gate["name"] == "hu_known")
     return known["measured"], [text for text in report["warnings"] if SAID in text]

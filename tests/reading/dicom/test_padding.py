@@ -58,6 +58,7 @@ def crossed_share(voxels, iso_value, pairs):
 
 
 def pairs_between(one, other):
+    """Which neighbours along x, and along y, lie on either side of a border, as masks."""
     return (one[:, 1:] & other[:, :-1]) | (other[:, 1:] & one[:, :-1]), (one[1:] & other[:-1]) | (other[1:] & one[:-1])
 
 

@@ -140,6 +140,7 @@ def test_stated_gap_is_compared_with_the_nearer_of_those_along_normal_and_table(
 
 
 def equal_headers(*thickness: float) -> list[Any]:
+    """Stand-ins for headers that differ in their thickness in mm alone."""
     count = len(thickness)
     columns: dict[str, list] = {"phase": [()] * count, "slice_thickness_mm": list(thickness), "padding": [None] * count}
     for name in ("slope", "intercept", "bits_stored", "high_bit", "bits_allocated", "signed"):
@@ -171,6 +172,7 @@ def files_read(monkeypatch):
 
 
 def stack_of(count):
+    """Headers of so many slices, a mm apart, of files that are named by their numbers."""
     return headers_with(file=list(range(count)), frames=[1] * count, position_mm=[(0.0, 0.0, k) for k in range(count)])
 
 
@@ -264,6 +266,7 @@ def test_start_of_equal_bytes_is_described_as_blank():
 
 
 def slices_named(*names):
+    """The names of slices, whose likeness is asked for."""
     named = _Slices(set(names))
     named.finish()
     return named

@@ -167,6 +167,7 @@ def test_more_frames_than_the_header_says_are_refused(tmp_path, syntax):
 
 # --- behind the pixel data ---
 def element(tag, vr, value, syntax):
+    """The bytes of an element with a long head in a transfer syntax."""
     order = ">" if syntax == ExplicitVRBigEndian else "<"
     head = struct.pack(order + "HH", tag >> 16, tag & 0xFFFF)
     if syntax == ImplicitVRLittleEndian:
@@ -175,6 +176,7 @@ def element(tag, vr, value, syntax):
 
 
 def append(folder, data):
+    """Put bytes behind each file of a folder."""
     for file in folder.iterdir():
         file.write_bytes(file.read_bytes() + data)
 

@@ -30,6 +30,7 @@ def check_marks(volume: Volume, truth: Marks, bound_mm: float) -> None:
 
 
 def check_warnings(volume: Volume, verdict: str, words: tuple[str, ...]) -> None:
+    """There are warnings exactly where the verdict says so, with all of the words."""
     text = "; ".join(volume.report["warnings"])
     assert bool(text) == (verdict == WARNED), text
     for word in words:

@@ -150,6 +150,7 @@ def failed_gates(path):
 
 
 def problem_with_strict_gates(path):
+    """What `info --pixels --strict` says against a file; None if all gates pass."""
     return describe_input(path, InfoSettings(pixels=True, strict=True)).problem
 
 

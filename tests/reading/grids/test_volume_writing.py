@@ -32,6 +32,7 @@ PLANS = {
 
 
 def read_scan(tmp_path, plan):
+    """One of the `PLANS` of 5 slices of 6 x 9 pixels, as a volume."""
     dicom_series.write_series(tmp_path / "ct", PLANS[plan])
     return read_dicom(tmp_path / "ct")
 
@@ -195,6 +196,7 @@ def test_volume_of_one_slice_is_written_with_its_thickness(tmp_path, name):
 
 
 def centres_of_voxels(volume):
+    """Indices (n, 3) of all voxels, i, j and k."""
     nk, nj, ni = volume.voxels.shape
     return np.array([(i, j, k) for k in range(nk) for j in range(nj) for i in range(ni)], float)
 

@@ -175,6 +175,7 @@ def test_impossible_value_is_refused_in_the_same_words_when_a_style_is_replaced(
 
 
 def clipped_where_it_can_be(style: type[Style]) -> Style:
+    """A style, with a clip box if styles of its kind have one."""
     options: dict[str, Any] = {"clip": Clip.box((0, 0, 0), (9, 9, 9))} if "clip" in WRONG[style] else {}
     return style(**options)
 

@@ -16,6 +16,7 @@ RAS = POINTS * (-1.0, -1.0, 1.0)
 
 
 def markups(points, system="LPS", **fields):
+    """A curve as 3D Slicer writes it; behind its points stands one that was not set."""
     control = [{"id": str(n), "position": list(point), "positionStatus": "defined"} for n, point in enumerate(points)]
     control.append({"id": "9", "position": [0.0, 0.0, 0.0], "positionStatus": "preview"})
     return {"markups": [{"type": "Curve", "coordinateSystem": system, "controlPoints": control} | fields]}

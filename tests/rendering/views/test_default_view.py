@@ -23,6 +23,7 @@ def test_slices_across_the_axes_of_the_patient_are_seen_from_the_first_view(norm
 
 
 def random_normals() -> np.ndarray:
+    """500 unit vectors."""
     normals = np.random.default_rng(3).normal(size=(500, 3))
     return normals / np.linalg.norm(normals, axis=1)[:, None]
 
