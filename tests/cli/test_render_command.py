@@ -260,7 +260,7 @@ def test_jitter_is_reported_and_changes_the_picture(render: Renders) -> None:
     assert (plain != jittered).any()
 
 
-def test_window_maps_its_ends_to_black_and_white(render: Renders) -> None:
+def test_window_maps_hu_to_grey_in_proportion_between_its_ends(render: Renders) -> None:
     image, report = render("--mode", "mip", "--window", f"{AIR_HU},{3 * BLOCK_HU}", "--values", render.folder / "v.npy")
     assert report["pictures"][0]["window_hu"] == [AIR_HU, 3 * BLOCK_HU]
     values = np.load(render.folder / "v.npy")
