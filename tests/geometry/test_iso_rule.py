@@ -118,19 +118,19 @@ def test_integers_are_not_scaled():
 
 
 @pytest.mark.parametrize(
-    ("low", "high", "dtype", "iso_value"),
+    ("low", "high", "dtype", "iso_value", "limit"),
     [
-        (0, 2**23, "int32", 5),
-        (-(2**23), 0, "int32", -5),
-        (0, 1e31, "float32", 5),
-        (-1e31, 0, "float32", 5),
-        (0, 1, "float32", 1e31),
-        (0, 9, "int16", -1e300),
+        (0, 2**23, "int32", 5, 2**23),
+        (-(2**23), 0, "int32", -5, 2**23),
+        (0, 1e31, "float32", 5, 1e30),
+        (-1e31, 0, "float32", 5, 1e30),
+        (0, 1, "float32", 1e31, 1e30),
+        (0, 9, "int16", -1e300, 1e30),
     ],
     ids=["high integers", "low integers", "high floats", "low floats", "level of floats", "level of integers"],
 )
-def test_values_and_levels_between_which_float32_cannot_interpolate_are_refused(low, high, dtype, iso_value):
-    with pytest.raises(UsageError, match="supported|interpolated"):
+def test_values_and_levels_between_which_float32_cannot_interpolate_are_refused(low, high, dtype, iso_value, limit):
+    with refused(UsageError, limit):
         choose_iso_rule(make_volume(low=low, high=high, dtype=dtype), iso_value)
 
 
@@ -168,9 +168,9 @@ def test_an_iso_value_that_is_not_finite_is_refused(bad):
         choose_iso_rule(make_volume(low=0, high=1), bad)
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_voxels_that_are_not_finite_are_refused(bad):
-    with pytest.raises(NoSurfaceError, match="NaN|infinite"):
+@pytest.mark.parametrize(("bad", "word"), [(np.nan, "NaN"), (np.inf, "infinite")])
+def test_voxels_that_are_not_finite_are_refused(bad, word):
+    with refused(NoSurfaceError, word):
         choose_iso_rule(make_volume(low=0.0, high=bad, dtype="float32"), 0.5)
 
 
