@@ -199,17 +199,18 @@ def test_retry_makes_refused_cases_again_and_leaves_done_ones_as_they_are(whole_
     assert files_of(folder / "out" / "A") == before
 
 
-def test_collect_lists_a_case_that_was_not_made_as_missing_and_makes_none(cohort: Path, printed: Any) -> None:
-    (cohort / "more.csv").write_text("case,input\nA,ball1\nlater,ball2\n")
-    before = files_of(cohort / "out" / "A")
+def test_collect_lists_a_case_that_was_not_made_as_missing_and_makes_none(whole_batch: Batch, printed: Any) -> None:
+    output = whole_batch.folder / "out"
+    (whole_batch.folder / "m.csv").write_text("case,input\nA,ball1\nlater,ball2\n")
+    before = files_of(output / "A")
+    printed()
 
-    assert main(["batch", str(cohort / "more.csv"), "-o", str(cohort / "out"), "--collect", "--json"]) == 8
+    assert whole_batch.run("--collect", "--json") == 8
 
     assert printed().report()["statuses"] == {"done": 1, "missing": 1}
-    assert read_rows(cohort / "out")["later"]["status"] == "missing"
-    assert files_of(cohort / "out" / "A") == before
-    # The table of all cases, for the other tests.
-    assert main(["batch", str(cohort / "m.csv"), "-o", str(cohort / "out"), "--collect", "-q"]) == 8
+    assert read_rows(output)["later"]["status"] == "missing"
+    assert not (output / "later").exists()
+    assert files_of(output / "A") == before
 
 
 def test_existing_cases_stay_with_no_clobber(cohort: Path, printed: Any) -> None:
