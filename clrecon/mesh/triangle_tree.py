@@ -17,6 +17,9 @@ from clrecon.system.pieces import find_bounds, in_threads, sort_with_rows
 _LEAF, _FAN = 4, 8
 """Triangles in a leaf, and boxes in a node."""
 
+_MANY = 8
+"""Boxes for each point from which on it pays to ask in which of them the surface surely is near."""
+
 PIECE, MOST_PAIRS = 1 << 11, 1 << 18
 """Points that go down together, and pairs of a point and a box beyond which they part: each point far from a surface is
 about as near to many of its boxes."""
@@ -169,13 +172,14 @@ class TriangleTree:
         items = np.arange(len(limits))
         nodes, bounds = np.zeros(len(limits), np.intp), np.zeros(len(limits))
         for level in self._levels:
-            boxes = level[nodes]
+            boxes = level.take(nodes, axis=0)
             every = lowest(items, boxes)
-            pair, child = np.nonzero(every <= limits[items, None])
-            items = items[pair]
-            nodes = _FAN * nodes[pair] + child
-            bounds = every[pair, child]
-            if highest is not None and len(items):
+            near = np.flatnonzero(every <= limits.take(items)[:, None])
+            pair, child = near // _FAN, near % _FAN
+            items = items.take(pair)
+            nodes = _FAN * nodes.take(pair) + child
+            bounds = every.ravel().take(near)
+            if highest is not None and len(items) > _MANY * len(limits):
                 some, best = _least_of(items, far := highest(items, boxes[pair, :, child]))
                 limits[some] = np.minimum(limits[some], far[best])
             if len(items) > MOST_PAIRS and len(limits) > 1:
@@ -206,7 +210,8 @@ def _squares_to_boxes(columns: NDArray[np.floating], boxes: NDArray[np.float32])
     """Return squared distances (k, `_FAN`) of points (3, k) from boxes (k, 6, `_FAN`); infinity for empty ones."""
     squares = np.zeros((len(boxes), _FAN))
     for axis, column in enumerate(columns):
-        away = np.maximum(boxes[:, axis] - column[:, None], column[:, None] - boxes[:, axis + 3])
+        away = boxes[:, axis] - column[:, None]
+        np.maximum(away, column[:, None] - boxes[:, axis + 3], out=away)
         np.maximum(away, 0.0, out=away)
         squares += np.square(away, out=away)
     return squares
@@ -222,7 +227,9 @@ def _squares_to_contents(columns: Columns, boxes: NDArray[np.float32], slack: fl
     to_high = np.abs(columns - boxes[:, 3:].T)
     near, far = np.minimum(to_low, to_high) + slack, np.maximum(to_low, to_high)
     far *= far
-    return np.asarray((near * near - far).min(axis=0) + far.sum(axis=0))
+    near *= near
+    near -= far
+    return np.minimum(np.minimum(near[0], near[1]), near[2]) + (far[0] + far[1] + far[2])
 
 
 def _enter_boxes(begin: Columns, direction: Columns, boxes: NDArray[np.float32]) -> NDArray[np.float64]:
