@@ -240,8 +240,8 @@ SIXTEEN_CHUNKS = 16 * FEWEST_PER_CHUNK
         (device(1), 1, (FEWEST_PER_CHUNK, 1)),
         (device(1), SIXTEEN_CHUNKS, (FEWEST_PER_CHUNK, 16)),
         (device(1), SIXTEEN_CHUNKS + 1, (FEWEST_PER_CHUNK + 1, 16)),
-        (device(3), 24 * 5000 + 1, (5001, 24)),
-        (device(3, has_long_items=False), 24 * 5000 + 1, (FEWEST_PER_CHUNK, 30)),
+        (device(3), 24 * 5000 + 1, (5001, 24)),  # eight a core
+        (device(3, has_long_items=False), 24 * 5000 + 1, (FEWEST_PER_CHUNK, -(-(24 * 5000 + 1) // FEWEST_PER_CHUNK))),
         (device(10_000), MOST_CHUNKS * 5000, (5000, MOST_CHUNKS)),
     ],
     ids=["one key", "sixteen chunks", "one key more", "three cores", "short items", "most chunks"],

@@ -99,6 +99,7 @@ def test_two_diagonal_inside_corners_of_a_face_have_a_surface_each():
 
 
 def test_packed_case_table_has_every_triangle_of_the_table():
+    """A word has four bits of the number of triangles, and then four of each of their edges."""
     for case, word in enumerate(pack_case_table()):
         word = int(word)
         edges = [word >> 4 * place & 15 for place in range(1, 16)]

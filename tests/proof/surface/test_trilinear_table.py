@@ -170,6 +170,10 @@ def test_inside_corners_across_a_face_are_one_region_only_if_the_face_joins_them
 
 
 def test_packed_trilinear_tables_have_every_row_of_the_table():
+    """Words, from their lowest bits on.  A case: 16 of its first state, then its ambiguous faces.  A state: 16 of its
+    first row, then two of each code of an interior, how many rows further on its row is.  A row: 16 of its first
+    triangle, five of their number, three of its vertices inside, then its diagonal.  A triangle: five of each corner.
+    """
     tables = pack_trilinear_tables()
     number = 0
     for case in range(256):
