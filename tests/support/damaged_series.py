@@ -89,7 +89,7 @@ def make_patient() -> np.ndarray:
     return np.rint(np.clip(400.0 * (1.0 - body), -1000.0, 50.0) + np.clip(1000.0 - 100.0 * bone, 0.0, 800.0))
 
 
-def at_one(k: int, odd: Any, usual: Any) -> Any:
+def at_one(k: int, *, odd: Any, usual: Any) -> Any:
     """A value of slice k, and the usual one of all others."""
     return lambda slice_number: odd if slice_number == k else usual
 
@@ -148,7 +148,7 @@ PLACES = {
     ),
     "orientation of zeros": refused("off unit length or right angle", ImageOrientationPatient=[0] * 6),
     "orientation of one slice differs": refused(
-        "1 slice missing between", ImageOrientationPatient=at_one(5, [0, 1, 0, 0, 0, -1], [1, 0, 0, 0, 1, 0])
+        "1 slice missing between", ImageOrientationPatient=at_one(5, odd=[0, 1, 0, 0, 0, -1], usual=[1, 0, 0, 0, 1, 0])
     ),
     "orientation of another plane": refused(
         "all 12 images lie in one plane", ImageOrientationPatient=[0, 1, 0, 0, 0, -1]
@@ -171,7 +171,7 @@ PLACES = {
     "pixel spacing 0": refused("expected two numbers from 0.001 to 50 mm", PixelSpacing=[0, 0.5]),
     "pixel spacing in metres": refused("expected two numbers from 0.001 to 50 mm", PixelSpacing=[0.0007, 0.0005]),
     "pixel spacing of one slice doubled": refused(
-        "PixelSpacing differs within the series", PixelSpacing=at_one(5, [1.4, 1.0], [0.7, 0.5])
+        "PixelSpacing differs within the series", PixelSpacing=at_one(5, odd=[1.4, 1.0], usual=[0.7, 0.5])
     ),
     "pixel spacing doubled": as_stated(
         "stated_places", "ReconstructionDiameter says 11.2 mm", PixelSpacing=[1.4, 1.0], ReconstructionDiameter=11.2
@@ -195,7 +195,7 @@ PLACES = {
     "thickness 0": exact(SliceThickness=0),
     "thickness below 0": exact(SliceThickness=-1.25),
     "thickness of one slice differs": exact(
-        "", "SliceThickness differs along the stack", SliceThickness=at_one(5, 5, 1.25)
+        "", "SliceThickness differs along the stack", SliceThickness=at_one(5, odd=5, usual=1.25)
     ),
     "thickness half the gap, instance numbers in steps": exact(
         "complete_series gap_thickness", "slices missing according to the numbers", SliceThickness=0.625
@@ -221,7 +221,7 @@ PLACES = {
     "rows 0": refused("Rows (0028,0010) x Columns (0028,0011) is 0 x 18", Rows=0),
     "rows doubled": refused("truncated: 1152 bytes of pixels expected", Rows=32),
     "rows halved": refused("more pixels than the header says", Rows=8),
-    "rows of one slice halved": refused("slice005.dcm: Pixel Data has 576 bytes", Rows=at_one(5, 8, 16)),
+    "rows of one slice halved": refused("slice005.dcm: Pixel Data has 576 bytes", Rows=at_one(5, odd=8, usual=16)),
     "rows and columns exchanged": seen("Rows and Columns seem to be swapped", Rows=96, Columns=72),
     "SeriesInstanceUID missing": exact("", "no SeriesInstanceUID", SeriesInstanceUID=None),
     "a series for each slice": refused(
@@ -258,9 +258,9 @@ class Row:
     hu: np.ndarray | None = None
 
 
-def stated(gates: str, words: str, plan: Plan | None = None, hu: np.ndarray | None = None, **values: Any) -> Row:
+def stated(gates: str, words: str, *, plan: Plan | None = None, hu: np.ndarray | None = None, **values: Any) -> Row:
     """A damage of values that is read as stated; failed gates, and a word of the message."""
-    return Row(values, set(gates.split()), words, plan, hu)
+    return Row(values, set(gates.split()), words, plan=plan, hu=hu)
 
 
 def make_padded() -> np.ndarray:
@@ -294,9 +294,9 @@ VALUES: dict[str, Row] = {
     ),
     "Modality LUT beside the slope": stated("hu_known", "Modality LUT Sequence (0028,3000)", **LUT),
     "signed values declared unsigned": stated(
-        "stored_sign", "seem to be signed", Plan(shape=SHAPE, intercept=0), PixelRepresentation=0
+        "stored_sign", "seem to be signed", plan=Plan(shape=SHAPE, intercept=0), PixelRepresentation=0
     ),
-    "unsigned values declared signed": stated("stored_sign", "dense bone or metal", TWELVE, PixelRepresentation=1),
+    "unsigned values declared signed": stated("stored_sign", "dense bone or metal", plan=TWELVE, PixelRepresentation=1),
     "padding value missing": stated("", UNDECLARED, hu=make_padded()),
     "padding value doubled": stated("", UNDECLARED, hu=make_padded(), PixelPaddingValue=-4000),
     "padding value with the wrong sign": stated("", UNDECLARED, hu=make_padded(), PixelPaddingValue=2000),
@@ -308,7 +308,7 @@ VALUES: dict[str, Row] = {
     "padding range limit with the wrong sign": stated(
         "padding_share one_volume", MASKED, hu=make_padded(), PixelPaddingValue=-2000, PixelPaddingRangeLimit=2000
     ),
-    "too few stored bits": stated("stored_bits", "beyond the 11 stored bits", TWELVE, BitsStored=11, HighBit=10),
+    "too few stored bits": stated("stored_bits", "beyond the 11 stored bits", plan=TWELVE, BitsStored=11, HighBit=10),
 }
 
 

@@ -24,7 +24,7 @@ def _spoiled(
         return marks
 
 
-def damage(file: Path, place: int, data: bytes) -> None:
+def damage(file: Path, *, place: int, data: bytes) -> None:
     """Write over bytes of a file."""
     with open(file, "r+b") as stream:
         stream.seek(place)
@@ -72,13 +72,13 @@ def add_byte_cases() -> None:
     _spoiled("the last slice empty, no suffix", lambda file: os.truncate(file, 0), "but empty", **media)
     _spoiled(
         "the last slice without the letters DICM, no suffix",
-        lambda file: damage(file, 128, b"DIXM"),
+        lambda file: damage(file, place=128, data=b"DIXM"),
         "DICOM by its header, but without the mark at byte 128",
         **media,
     )
     _spoiled(
         "the last slice zeroed, no suffix",
-        lambda file: damage(file, 0, bytes(file.stat().st_size)),
+        lambda file: damage(file, place=0, data=bytes(file.stat().st_size)),
         "named like slices, but blank",
         **media,
     )

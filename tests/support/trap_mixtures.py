@@ -23,7 +23,7 @@ from trap_plan import (
 )
 
 
-def _interleaved(name: str, keyword: str, first: Any, second: Any) -> None:
+def _interleaved(name: str, keyword: str, *, first: Any, second: Any) -> None:
     """None leaves the element away."""
 
     @add_case(
@@ -60,12 +60,12 @@ def _write_moved(folder: Path, size: Size) -> Marks:
 
 def add_mixture_cases() -> None:
     """Put the rows into `CASES`."""
-    _interleaved("two recon kernels", "ConvolutionKernel", "B30f", "B70f")
-    _interleaved("two acquisition times", "AcquisitionTime", "101500", "103000")
-    _interleaved("two acquisition dates", "AcquisitionDate", "20200101", "20200102")
-    _interleaved("two content times", "ContentTime", "101500", "103000")
-    _interleaved("before and after contrast agent", "ContrastBolusAgent", None, "IODINE")
-    _interleaved("AcquisitionNumber only in every second slice", "AcquisitionNumber", None, 2)
-    _interleaved("two acquisition numbers", "AcquisitionNumber", 1, 2)
+    _interleaved("two recon kernels", "ConvolutionKernel", first="B30f", second="B70f")
+    _interleaved("two acquisition times", "AcquisitionTime", first="101500", second="103000")
+    _interleaved("two acquisition dates", "AcquisitionDate", first="20200101", second="20200102")
+    _interleaved("two content times", "ContentTime", first="101500", second="103000")
+    _interleaved("before and after contrast agent", "ContrastBolusAgent", first=None, second="IODINE")
+    _interleaved("AcquisitionNumber only in every second slice", "AcquisitionNumber", first=None, second=2)
+    _interleaved("two acquisition numbers", "AcquisitionNumber", first=1, second=2)
     name = "two volumes that differ only in their pixels, interleaved"
     add_case(name, WARNED, ("maybe two volumes between each other",))(_write_moved)

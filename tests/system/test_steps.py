@@ -23,7 +23,7 @@ def test_steps_are_reported_from_none_to_all_and_never_above():
 
 
 def test_steps_without_a_report_are_counted():
-    steps = Steps(None, stage="mask", total=2)
+    steps = Steps(progress=None, stage="mask", total=2)
     steps.take()
     assert steps.done == 1
 

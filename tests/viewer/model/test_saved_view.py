@@ -76,7 +76,7 @@ def show_projection(model: ViewModel) -> None:
 
 def show_fit(model: ViewModel) -> None:
     model.set_iso(250.0)
-    model.set_fitted(True)
+    model.set_fitted(shown=True)
     model.set_color_by("thickness")
 
 

@@ -24,7 +24,7 @@ def test_straight_slices_look_up_back_and_to_the_right_of_the_patient() -> None:
 
 
 def test_quarter_turn_on_the_axial_slice_turns_the_two_others_clockwise_and_leaves_it() -> None:
-    turn = turn_cross(None, "axial", degrees=90.0)
+    turn = turn_cross(turn=None, plane="axial", degrees=90.0)
 
     looks = [find_forward(plane, turn) for plane in ("axial", "coronal", "sagittal")]
 
@@ -45,7 +45,7 @@ def test_turned_slices_stay_across_each_other_after_a_thousand_turns() -> None:
 def test_slice_on_which_the_cross_is_turned_stays_as_it_is() -> None:
     camera = find_plane(scenes.make_scan(), "sagittal", size=(200, 100))
 
-    turned = turn_plane(camera, turn_cross(None, "sagittal", degrees=35.0))
+    turned = turn_plane(camera, turn_cross(turn=None, plane="sagittal", degrees=35.0))
 
     assert np.allclose(np.array(turned.basis()), np.array(camera.basis()), rtol=0, atol=ROUNDING)
 
@@ -53,7 +53,7 @@ def test_slice_on_which_the_cross_is_turned_stays_as_it_is() -> None:
 @pytest.mark.parametrize("degrees", [20.0, 90.0])  # beyond 72 degrees little of the upward direction lies in the slice
 def test_turned_slice_is_seen_along_its_direction_from_as_far_away(degrees: float) -> None:
     camera = find_plane(scenes.make_scan(), "coronal", size=(200, 100))
-    turn = turn_cross(None, "sagittal", degrees=degrees)
+    turn = turn_cross(turn=None, plane="sagittal", degrees=degrees)
 
     turned = turn_plane(camera, turn)
 

@@ -73,7 +73,7 @@ def test_region_between_two_layers_takes_one_of_them(z: float) -> None:
 def test_region_on_an_oblique_thick_slice_takes_all_voxels_within_its_thickness(thickness: float) -> None:
     volume = make_noise(scenes.AFFINE)
     middle = volume.ijk_to_lps([8.3, 7.1, 6.4])
-    turns = (turn_cross(None, "axial", degrees=25.0), turn_cross(None, "sagittal", degrees=35.0))
+    turns = (turn_cross(turn=None, plane="axial", degrees=25.0), turn_cross(turn=None, plane="sagittal", degrees=35.0))
     right, up = (np.array(turns[0]) @ np.array(turns[1]) @ axis for axis in (X, Y))
     points = place_region("circle", tuple(middle), tuple(middle + 4.5 * right), right=right, up=up)
 
@@ -88,7 +88,7 @@ def test_region_on_an_oblique_thick_slice_takes_all_voxels_within_its_thickness(
 def test_thin_region_on_an_oblique_slice_takes_one_voxel_of_each_column_through_it() -> None:
     volume = make_noise(np.diag([1.0, 1.0, 1.0, 1.0]))
     middle = np.array([8.0, 8.0, 7.0])
-    right, up = (np.array(turn_cross(None, "sagittal", degrees=20.0)) @ axis for axis in (X, Y))
+    right, up = (np.array(turn_cross(turn=None, plane="sagittal", degrees=20.0)) @ axis for axis in (X, Y))
     half = 5.2 * (right + up)
     points = place_region("box", tuple(middle - half), tuple(middle + half), right=right, up=up)
 
