@@ -48,10 +48,10 @@ def test_command_within_both_limits_or_beside_a_peer_that_failed_does_not_stand_
 
 
 def test_error_of_a_process_that_fails_is_its_exit_code_and_last_line(tmp_path: Path) -> None:
-    run = outliers.time_process(["sh", "-c", "echo first >&2; echo last >&2; exit 5"], str(tmp_path), 60.0)
+    run = outliers.time_process(["sh", "-c", "echo first >&2; echo last >&2; exit 5"], str(tmp_path), limit_s=60.0)
     assert run.error == "exit 5: last"
 
 
 def test_process_over_its_time_limit_is_ended_with_an_error(tmp_path: Path) -> None:
-    run = outliers.time_process(["sleep", "3600"], str(tmp_path), 0.2)
+    run = outliers.time_process(["sleep", "3600"], str(tmp_path), limit_s=0.2)
     assert run.error == "over 0.2 s"

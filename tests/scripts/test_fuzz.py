@@ -282,7 +282,8 @@ def test_command_that_went_wrong_has_the_kind_of_its_fault(given, code, out, err
 
 
 def test_words_on_standard_error_beside_a_mesh_on_standard_output_are_no_fault() -> None:
-    commands.check_call(["mesh", "ct", "-o", "-"], 0, "solid", "wrote    standard output\n")
+    given, code, out, err = ["mesh", "ct", "-o", "-"], 0, "solid", "wrote    standard output\n"
+    assert commands.check_call(given, code, out, err) is None  # else it raises a WrongOutcome
 
 
 @pytest.mark.parametrize(
@@ -294,7 +295,7 @@ def test_file_that_a_command_leaves_behind_is_a_fault(code, name) -> None:
 
 
 def test_output_of_a_command_that_succeeds_is_no_fault() -> None:
-    commands.check_files(0, [Path("out.stl")])
+    assert commands.check_files(0, [Path("out.stl")]) is None  # else it raises a WrongOutcome
 
 
 @pytest.fixture

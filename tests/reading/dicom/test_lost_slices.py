@@ -54,7 +54,7 @@ def deny(monkeypatch):
 @pytest.mark.parametrize("cut", ["slice000.dcm", "slice003.dcm", "slice006.dcm"])
 def test_cut_file_beside_the_slices_refuses_the_series(tmp_path, cut):
     write_series(tmp_path)
-    (tmp_path / cut).write_bytes((tmp_path / cut).read_bytes()[:600])
+    (tmp_path / cut).write_bytes((tmp_path / cut).read_bytes()[:600])  # within its header
     assert_series_refused(tmp_path, f"{cut}: ends within")
 
 

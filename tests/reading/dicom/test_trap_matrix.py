@@ -18,7 +18,7 @@ from clrecon.reading import read_volume
 BOUNDS_MM = {"written": AFFINE_MM, "rounded": ROUNDED_AFFINE_MM, "far": FAR_AFFINE_MM, "jitter": JITTER_AFFINE_MM}
 
 
-def check_marks(volume: Volume, truth: Marks, bound_mm: float) -> None:
+def assert_marks(volume: Volume, truth: Marks, bound_mm: float) -> None:
     """Every mark of the stack is there once, at its place, and nothing else is."""
     assert volume.voxels.shape[0] == truth.slices
     kji = np.argwhere((volume.voxels != BACKGROUND_HU) & (volume.voxels != BODY_HU))
@@ -29,7 +29,7 @@ def check_marks(volume: Volume, truth: Marks, bound_mm: float) -> None:
     assert errors.max() < bound_mm, f"a mark lies {errors.max():.2g} mm off"
 
 
-def check_warnings(volume: Volume, verdict: str, words: tuple[str, ...]) -> None:
+def assert_warnings(volume: Volume, verdict: str, words: tuple[str, ...]) -> None:
     """There are warnings exactly where the verdict says so, with all of the words."""
     text = "; ".join(volume.report["warnings"])
     assert bool(text) == (verdict == WARNED), text
@@ -49,8 +49,8 @@ def test_each_trap_gets_its_verdict(tmp_path: Path, case: Case) -> None:
         assert "\n" not in str(caught.value)
         return
     volume = read_volume(tmp_path)
-    check_warnings(volume, case.verdict, case.words)
-    check_marks(volume, truth, BOUNDS_MM[case.bound])
+    assert_warnings(volume, case.verdict, case.words)
+    assert_marks(volume, truth, BOUNDS_MM[case.bound])
 
 
 @pytest.mark.parametrize(
@@ -59,20 +59,20 @@ def test_each_trap_gets_its_verdict(tmp_path: Path, case: Case) -> None:
 def test_refused_row_is_read_on_request_within_its_bound(tmp_path: Path, case: Case) -> None:
     truth = case.write(tmp_path, Size())
     volume = read_volume(tmp_path, **dict(case.again or {}))
-    check_warnings(volume, EXACT if "series" in dict(case.again or {}) else WARNED, case.again_words)
-    check_marks(volume, truth, BOUNDS_MM[case.bound])
+    assert_warnings(volume, EXACT if "series" in dict(case.again or {}) else WARNED, case.again_words)
+    assert_marks(volume, truth, BOUNDS_MM[case.bound])
 
 
 @pytest.mark.parametrize("harm", ["stretched", "reversed"])
 def test_check_of_marks_fails_for_a_stack_that_is_stretched_or_reversed(tmp_path: Path, harm: str) -> None:
     truth = CASES["regular, non-square pixels"].write(tmp_path, Size())
     volume = read_volume(tmp_path)
-    check_marks(volume, truth, AFFINE_MM)
+    assert_marks(volume, truth, AFFINE_MM)
     stretched = np.array(volume.affine)
     stretched[:3, 2] *= 1.00001  # 24 slices of a mm and more: off by a hundred times the bound and more
     wrong = Volume(volume.voxels, stretched) if harm == "stretched" else Volume(volume.voxels[::-1], volume.affine)
     with pytest.raises(AssertionError, match="a mark lies"):
-        check_marks(wrong, truth, AFFINE_MM)
+        assert_marks(wrong, truth, AFFINE_MM)
 
 
 def test_trap_cases_cover_every_verdict() -> None:
