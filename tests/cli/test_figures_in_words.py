@@ -189,10 +189,10 @@ def test_space_of_a_file_is_metres_for_glb_and_mm_of_its_frame_for_others() -> N
     assert common.describe_space("a.glb.stl", "ras") == "RAS mm"
 
 
-@pytest.mark.parametrize("levels", [(200.0, 300.0), ((200.0, 300.0),)])
+@pytest.mark.parametrize("levels", [(200.0, 300.0), ((200.0, 300.0),)], ids=["two levels", "a range"])
 def test_comparison_at_two_levels_or_a_range_is_refused(levels: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(common, "pick", lambda *given: {"iso_value": {"iso_value": levels}})
-    with refused(UsageError, "value"):
+    with refused(UsageError, "--hu", "one"):
         compare.run(argparse.Namespace(), Console())
 
 

@@ -41,11 +41,11 @@ BAD_TABLES = {
     "unknown columns": ("case,input,hu,sereis\na,b,1,2\n", ("hu", "sereis", "series")),
     "no column of inputs": ("case,series\na,b\n", ("input",)),
     "a column twice": ("case,input,case\na,b,c\n", ("twice",)),
-    "one case twice": ("case,input\na,x\nb,x\na,y\n", (2, 4, "a")),
+    "one case twice": ("case,input\nP-1,x\nb,x\nP-1,y\n", (2, 4, "P-1")),
     "cases that differ in capitals": ("case,input\nScan,x\nscan,y\n", (2, 3)),
     "too few cells": ("case,input\na,x\nb\n", (3, 1, 2)),
     "too many cells": ("case,input\na,x,y\n", (2, 3)),
-    "no input": ("case,input\na,\n", (2, "a")),
+    "no input": ("case,input\nP-1,\n", (2, "P-1")),
     "a case without a name": ("case,input\n,x\n", (2,)),
     "a way out of the output": ("case,input\n../a,x\n", (2,)),
     "a hidden folder": ("case,input\n.a,x\n", (2,)),
@@ -127,8 +127,8 @@ def test_folder_without_stacks_is_refused_and_the_columns_of_manifests_are_named
 @pytest.mark.parametrize("output", ["ct/out", "."], ids=["within the input", "around the input"])
 def test_output_within_or_about_an_input_is_refused(output: str, tmp_path: Path) -> None:
     (tmp_path / "ct").mkdir()
-    case = Case(name="a", source=str(tmp_path / "ct"), series=None, labels=None)
-    with refused(UsageError, "a"):
+    case = Case(name="P-1", source=str(tmp_path / "ct"), series=None, labels=None)
+    with refused(UsageError, "P-1"):
         check_places([case], tmp_path / output)
 
 
