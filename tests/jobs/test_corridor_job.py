@@ -77,7 +77,7 @@ def test_surface_of_the_bone_of_a_vertebra_is_fitted_within_a_fraction_of_a_voxe
 ) -> None:
     off_mm = fitted_vertebra.vertebra.depth(fitted_vertebra.bone.surface)
 
-    assert abs(np.median(off_mm)) < 0.06  # voxels of 1 mm; at the level of 150 HU it is 0.35
+    assert abs(np.median(off_mm)) < 0.06  # measured 0.045; at the level of 150 HU it is 0.35
     assert np.abs(off_mm).mean() < 0.1  # measured 0.053
 
 
@@ -184,13 +184,15 @@ def reported(request: pytest.FixtureRequest, device: Any) -> Any:
     name, bar = request.param
     folder: Path = request.getfixturevalue(name)
     report = load(folder / "report.json")
+    (vertebra,) = report["vertebrae"]
+    left, right = vertebra["corridors"]
     return SimpleNamespace(
         name=name,
         bar=bar,
         report=report,
         said=(folder / "said.txt").read_text(),
         to_lps=np.array([-1.0, -1.0, 1.0]) if name == "l1_with_screws" else np.ones(3),
-        sides=report["vertebrae"][0]["corridors"],
+        sides=(left, right),
     )
 
 

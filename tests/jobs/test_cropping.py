@@ -179,7 +179,11 @@ def test_picture_of_a_crop_shows_it_larger_and_is_cut_at_its_six_sides(scan: Pat
 
 
 def test_slice_of_a_crop_is_drawn(scan: Path, tmp_path: Path) -> None:
-    assert run("render", scan, "-o", tmp_path / "p.png", "--mode", "slice", "--between", "110,130", "-q") == 0
+    command = ["render", scan, "-o", tmp_path / "p.png", "--mode", "slice", "--report", tmp_path / "r.json", "-q"]
+
+    assert run(*command, "--between", "110,130") == 0
+
+    assert json.loads((tmp_path / "r.json").read_text())["volume"]["shape_ijk"] == [40, 40, 130 - 110 + 1]
     assert (tmp_path / "p.png").exists()
 
 
@@ -219,7 +223,7 @@ def test_wrong_crop_is_refused_in_one_line_and_writes_nothing(
 def test_crop_box_is_the_common_part_of_box_slab_and_cube() -> None:
     box, slab, cube = (0, 9, 0, 9, 0, 9), (3, 20), (1, 5, 5, 4)  # X0,X1,Y0,Y1,Z0,Z1; Z0,Z1; centre and half a side
 
-    low, high = crop_box(box, slab, cube)
+    low, high = crop_box(box, between=slab, around=cube)
 
     assert low == (0, max(0, 5 - 4), max(0, 3, 5 - 4))
     assert high == (min(9, 1 + 4), min(9, 5 + 4), min(9, 20, 5 + 4))
@@ -228,7 +232,7 @@ def test_crop_box_is_the_common_part_of_box_slab_and_cube() -> None:
 @pytest.mark.unit
 def test_crop_box_of_a_slab_has_no_end_across_it() -> None:
     everywhere = float("inf")
-    assert crop_box(None, (1, 2), None) == ((-everywhere, -everywhere, 1), (everywhere, everywhere, 2))
+    assert crop_box(None, between=(1, 2), around=None) == ((-everywhere, -everywhere, 1), (everywhere, everywhere, 2))
 
 
 @pytest.mark.unit

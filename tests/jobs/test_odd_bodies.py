@@ -183,7 +183,7 @@ def test_largest_component_without_the_table_is_bone(odd: OddBodies, device: Any
     body = odd[name]
     report, vertices = mesh_of(odd, device, tmp_path, name, iso_value=300.0, remove_table=True, keep_largest=1)
     assert report["components_kept"] == 1 <= report["components_found"]
-    assert share_near(body, vertices, "bone", "metal", "contrast") > 0.9  # measured from 0.988 on
+    assert share_near(body, vertices, "bone", "metal", "contrast") > 0.97  # measured from 0.988 on
 
 
 @pytest.mark.parametrize("name", daily(3, BONY))
@@ -196,8 +196,8 @@ def test_seed_in_bone_keeps_one_component_of_bone_about_it(
     report, vertices = mesh_of(odd, device, tmp_path, name, iso_value=300.0, seeds=[tuple(seed)])
     assert report["components_kept"] == 1
     nearest = np.linalg.norm(body.volume.ijk_to_lps(vertices) - seed, axis=1).min()
-    assert nearest < 10.0  # mm, a few voxels: measured up to 2.3
-    assert share_near(body, vertices, "bone", "metal", "table") > 0.9  # measured from 0.994 on
+    assert nearest < 5.0  # mm, a voxel or two: measured up to 2.3
+    assert share_near(body, vertices, "bone", "metal", "table") > 0.98  # measured from 0.994 on
 
 
 @pytest.mark.parametrize("name", daily(4, SPINELESS))
@@ -214,7 +214,7 @@ def test_picture_along_the_spine_of_a_trunk_is_drawn(odd: OddBodies, device: Any
     settings = RenderSettings.of(curve="auto", device=str(device.index), size=(40, 40))
     report = make_pictures(odd.series("contrast"), PictureFiles(picture=str(tmp_path / "spine.png")), settings)
     (picture,) = report["pictures"]
-    assert picture["curve"] and (tmp_path / "spine.png").stat().st_size > 200  # measured 2,615 bytes
+    assert picture["curve"] and (tmp_path / "spine.png").stat().st_size > 1000  # measured 2,615 bytes
 
 
 @pytest.mark.parametrize("name", daily(3, BONY))
@@ -283,8 +283,8 @@ def test_contrast_medium_in_the_surface_of_a_trunk_is_warned_of(odd: OddBodies, 
 def test_keep_bone_leaves_out_the_contrast_medium_of_a_trunk(odd: OddBodies, device: Any, tmp_path: Path) -> None:
     _, vertices = mesh_of(odd, device, tmp_path, "contrast", preset="bone", remove_table=True, keep="bone")
 
-    assert share_near(odd["contrast"], vertices, "contrast") < 0.05  # measured 1e-4; with all that is there 0.311
-    assert share_near(odd["contrast"], vertices, "bone") > 0.9  # measured 0.998
+    assert share_near(odd["contrast"], vertices, "contrast") < 0.01  # measured 1e-4; with all that is there 0.311
+    assert share_near(odd["contrast"], vertices, "bone") > 0.99  # measured 0.998
 
 
 @pytest.mark.parametrize(
@@ -311,7 +311,7 @@ def test_surface_below_a_level_encloses_the_air_within_a_body_and_leaves_out_tha
     least_ml, most_ml = kept_ml
     assert least_ml < facts["kept_ml"] < most_ml < facts["left_out_ml"]
     assert any(f"{format_ml(facts['kept_ml'])} within it" in warning for warning in report["warnings"])
-    assert share_near(body, vertices, "table") < 0.1  # measured up to 0.004 (skull in its headrest)
+    assert share_near(body, vertices, "table") < 0.01  # measured up to 0.004 (skull in its headrest)
     assert share_near(body, vertices, "tissue", "bone") > 0.85  # measured 0.89 (bones), else from 0.97 on
 
 
@@ -349,7 +349,7 @@ def test_surface_of_a_range_of_hu_lies_on_the_material_with_these_values_at_both
 
     _, vertices = mesh_of(odd, device, tmp_path, name, iso_value=(band,), remove_table=True)
 
-    assert share_near(body, vertices, *materials) > 0.9  # measured 0.998 and 1
+    assert share_near(body, vertices, *materials) > 0.99  # measured 0.998 and 1
     hu = ndimage.map_coordinates(body.volume.voxels.astype(float), vertices[:, ::-1].T, order=1)
     at_lower, at_upper = ((np.abs(hu - end) < 1.0).mean() for end in band)
     assert at_lower > 0.7  # measured 0.83 and 0.99
@@ -375,8 +375,10 @@ def test_print_without_the_table_is_one_closed_piece_of_bone(
         report, vertices = mesh_of(odd, device, tmp_path, name, **PRINT_WITHOUT_TABLE)
 
     assert (report["closed"], report["components"]) == (True, 1)
-    assert share_near(odd[name], vertices, "bone", "metal") > 0.9  # measured 0.98 of both
-    assert all(gate["ok"] for gate in report["gates"] if gate["name"] in ("bone_kept", "watertight"))
+    assert share_near(odd[name], vertices, "bone", "metal") > 0.95  # measured 0.98 of both
+    (bone_kept,) = (gate for gate in report["volume"]["gates"] if gate["name"] == "bone_kept")
+    assert bone_kept["ok"]
+    assert [gate["name"] for gate in report["gates"] if gate["ok"] is False] == []
 
 
 def test_print_of_one_leg_of_a_pair_warns_of_the_other(printed_pair: tuple[dict, np.ndarray]) -> None:
@@ -395,7 +397,7 @@ def test_print_with_the_table_there_is_one_piece_of_bone_and_states_what_is_none
     report, vertices = mesh_of(odd, device, tmp_path, name, **settings)
 
     assert (report["keep"], report["components"]) == ("bone", 1)
-    assert share_near(odd[name], vertices, "bone", "metal") > 0.9  # measured from 0.976 on
+    assert share_near(odd[name], vertices, "bone", "metal") > 0.95  # measured from 0.976 on
     left_out, kept_ml = report["print"]["left_out"], report["print"]["pieces_ml"]
     assert 0.0 <= left_out["not_bone_ml"] <= left_out["pieces_ml"]
     without = f"{count_of(left_out['not_bone'], 'piece')} without"
@@ -408,7 +410,7 @@ def test_print_with_the_table_there_is_one_piece_of_bone_and_states_what_is_none
 def test_print_of_a_table_alone_is_refused_with_the_setting_that_prints_it(
     odd: OddBodies, device: Any, tmp_path: Path
 ) -> None:
-    with refused(NoSurfaceError, "keep_largest=1", 1):
+    with refused(NoSurfaceError, "keep_largest=1"):
         mesh_of(odd, device, tmp_path, "empty", **settings_for("print", {}))
 
 

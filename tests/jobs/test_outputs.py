@@ -63,7 +63,7 @@ def test_mesh_named_as_the_report_by_another_path_is_refused(tmp_path: Path) -> 
 def test_mesh_that_a_link_leads_to_another_mesh_is_refused(tmp_path: Path) -> None:
     (tmp_path / "bone_L1.stl").symlink_to(tmp_path / "bone_T12.stl")
     with refused(UsageError, "T12", "L1"):
-        check_outputs(tmp_path / "bone.stl", None, ["L1", "T12"])
+        check_outputs(tmp_path / "bone.stl", report_path=None, names=["L1", "T12"])
 
 
 @pytest.mark.parametrize("name", ["../T12", "a/b", "a\\b", "/tmp"])
@@ -84,7 +84,7 @@ def test_folder_in_the_place_of_a_mesh_is_refused_before_the_work(tmp_path: Path
     (tmp_path / "bone_350hu.stl").mkdir()
 
     with refused(OutputError, "bone_350hu.stl"):
-        check_outputs(tmp_path / "bone.stl", None, ["200hu", "350hu"])
+        check_outputs(tmp_path / "bone.stl", report_path=None, names=["200hu", "350hu"])
 
     assert [path.name for path in tmp_path.iterdir()] == ["bone_350hu.stl"]
 

@@ -195,7 +195,7 @@ def test_steps_and_the_region_among_them_are_reported_in_their_order(mesh_with: 
     *_, fill = steps = report["volume"]["preprocess"]
     assert [step["step"] for step in steps] == ["bilateral:0.8:30", "region", "level:250", "fill"]
     assert fill["band_hu"] == [250.0, None]  # of the level set before
-    assert all(step["seconds"] >= 0.0 for step in steps)
+    assert all("seconds" in step for step in steps)
     assert report["volume"]["region"]["rules"] == [str(rule) for rule in parse_region_rules(box)]
 
 

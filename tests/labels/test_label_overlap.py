@@ -16,12 +16,13 @@ def painter_of(names, only=None):
 
 
 def row_with(*voxels):
+    """A mask of these of the 4 voxels."""
     return np.array([[number in voxels for number in range(4)]])
 
 
 def test_segment_of_the_largest_number_is_painted():
     painter = painter_of({65_535: "last"})
-    painter.paint(0, 65_535, row_with(2))
+    painter.paint(k=0, number=65_535, mask=row_with(2))
     assert painter.finish(np.eye(4)).counts == {65_535: 1}
 
 
@@ -40,7 +41,7 @@ def test_first_of_three_pairs_that_overlap_equally_is_named_in_the_refusal():
     painter = painter_of({1: "L1", 2: "L2", 3: "L3"})
     # 1 and 2 share voxel 1; 3 shares voxel 0 with 1, and voxel 1 with 2, which was painted over 1
     for number, voxels in ((1, (0, 1)), (2, (1,)), (3, (0, 1))):
-        painter.paint(0, number, row_with(*voxels))
+        painter.paint(k=0, number=number, mask=row_with(*voxels))
     with refused(RefusedInputError, "L1", "L2", 1):
         painter.finish(np.eye(4))
 
@@ -48,7 +49,7 @@ def test_first_of_three_pairs_that_overlap_equally_is_named_in_the_refusal():
 def test_pair_with_the_largest_overlap_is_named_in_the_refusal():
     painter = painter_of({1: "L1", 2: "L2", 3: "L3"})
     for number, voxels in ((1, (0, 1, 2)), (2, (1,)), (3, (0, 2))):  # 1 and 2 share voxel 1, 1 and 3 two voxels
-        painter.paint(0, number, row_with(*voxels))
+        painter.paint(k=0, number=number, mask=row_with(*voxels))
     with refused(RefusedInputError, "L1", "L3", 2):
         painter.finish(np.eye(4))
 
@@ -56,8 +57,8 @@ def test_pair_with_the_largest_overlap_is_named_in_the_refusal():
 def test_voxels_that_two_segments_share_are_counted_over_all_slices():
     painter = Painter("a.dcm", np.zeros((5, 1, 4), np.uint16), {1: "L1", 2: "L2"}, Wanted())
     for k in range(5):
-        painter.paint(k, 1, row_with(0, 1))
-        painter.paint(k, 2, row_with(1, 2))
+        painter.paint(k, number=1, mask=row_with(0, 1))
+        painter.paint(k, number=2, mask=row_with(1, 2))
     with refused(RefusedInputError, "L1", "L2", 5):
         painter.finish(np.eye(4))
 

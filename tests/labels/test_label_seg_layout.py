@@ -48,29 +48,31 @@ def layout_of(kind, *, rows, columns, frames, bits):
 )
 def test_header_of_three_frames_is_read_from_a_file_that_can_hold_their_pixels(kind, bits, syntax, least_bytes):
     data_set = header_with(kind, bits, syntax, NumberOfFrames=3)
-    assert _read_layout(data_set, "a.dcm", least_bytes) == layout_of(kind, rows=10, columns=10, frames=3, bits=bits)
+    assert _read_layout(data_set, "a.dcm", file_bytes=least_bytes) == layout_of(
+        kind, rows=10, columns=10, frames=3, bits=bits
+    )
     with refused(RefusedInputError, "a.dcm", 10):
-        _read_layout(data_set, "a.dcm", least_bytes - 1)
+        _read_layout(data_set, "a.dcm", file_bytes=least_bytes - 1)
 
 
 def test_segmentation_that_does_not_say_its_number_of_frames_has_one():
-    assert _read_layout(header_with(), "a.dcm", 100).frames == 1
+    assert _read_layout(header_with(), "a.dcm", file_bytes=100).frames == 1
 
 
 @pytest.mark.parametrize(("kind", "bits"), [("BINARY", 16), ("LABELMAP", 1), ("LABELMAP", 32)])
 def test_bits_a_pixel_that_the_kind_of_segmentation_does_not_have_are_refused(kind, bits):
     with refused(RefusedInputError, 1, bits):
-        _read_layout(header_with(kind, bits), "a.dcm", 1000)
+        _read_layout(header_with(kind, bits), "a.dcm", file_bytes=1000)
 
 
 @pytest.mark.parametrize("frames", [0, 1_000_001])
 def test_number_of_frames_outside_of_one_to_a_million_is_refused(frames):
     with refused(RefusedInputError, frames):
-        _read_layout(header_with(NumberOfFrames=frames), "a.dcm", 1_000_001 * 100)
+        _read_layout(header_with(NumberOfFrames=frames), "a.dcm", file_bytes=1_000_001 * 100)
 
 
 def test_a_million_frames_are_accepted():
-    assert _read_layout(header_with(NumberOfFrames=1_000_000), "a.dcm", 1_000_000 * 100).frames == 1_000_000
+    assert _read_layout(header_with(NumberOfFrames=1_000_000), "a.dcm", file_bytes=1_000_000 * 100).frames == 1_000_000
 
 
 def test_pixels_of_one_bit_are_read_over_the_ends_of_bytes_to_the_last_bit():

@@ -340,7 +340,7 @@ def test_map_for_uneven_slices_has_four_or_two_slices_to_their_smallest_gap(sign
 @pytest.mark.parametrize("sign", [1.0, -1.0], ids=["up", "down"])
 def test_map_for_slices_5_micrometres_apart_is_refused(sign):
     with refused(UsageError, 5, "contours"):
-        label_slices_of_gap(0.005, sign)
+        label_slices_of_gap(gap=0.005, sign=sign)
 
 
 def uneven_scan(tilt, sign):

@@ -58,11 +58,11 @@ def test_triangles_around_a_vertex_are_those_that_name_it(torus_triangles, verte
 
 def test_vertices_that_triangles_use_are_listed_once_and_in_order():
     triangles = np.array([[5, 0, 3], [3, 0, 1]], np.uint32)
-    assert find_used(triangles, 7).tolist() == [0, 1, 3, 5]
+    assert find_used(triangles, size=7).tolist() == [0, 1, 3, 5]
 
 
 def test_no_triangles_use_no_vertices():
-    assert find_used(np.zeros((0, 3), np.uint32), 7).tolist() == []
+    assert find_used(np.zeros((0, 3), np.uint32), size=7).tolist() == []
 
 
 def test_triangles_are_numbered_by_the_vertices_that_they_use():

@@ -108,7 +108,7 @@ def test_interrupted_batch_ends_with_130_and_leaves_only_whole_cases(tmp_path: P
     _, errors = process.communicate(timeout=60)
     assert process.returncode == INTERRUPTED and "Traceback" not in errors
     left = sorted((tmp_path / "out").iterdir(), key=lambda folder: small_cases.index(folder.name))
-    assert [folder.name for folder in left] == small_cases[: len(left)] and len(left) < len(small_cases)
+    assert [folder.name for folder in left] == small_cases[: len(left)] and 0 < len(left) < len(small_cases)
     assert all((folder / "mesh.stl").is_file() and (folder / "case.json").is_file() for folder in left)
 
 

@@ -133,7 +133,7 @@ def test_auto_in_slices_2_mm_apart_has_no_warning() -> None:
 
 
 def test_reason_of_an_iso_value_names_its_preset() -> None:
-    entries, warnings = describe_level(ball(), MeshSettings(preset="bone"), None)
+    entries, warnings = describe_level(ball(), MeshSettings(preset="bone"), choice=None)
 
     assert entries["iso_value_reason"].startswith("preset bone: ")
     assert warnings == []

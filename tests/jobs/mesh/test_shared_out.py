@@ -77,7 +77,7 @@ def by_sent_spans(volume: Volume, level: Any, device: Device, **how: Any) -> Mes
         facts = GridFacts(volume.voxels.shape, volume.affine, positions, grid.rule)
         assert len(spans) == SPANS
         for span in reversed(spans):
-            yield span, make_sent_span(cut_voxels(grid, span), facts, device, None)
+            yield span, make_sent_span(cut_voxels(grid, span), facts, device, memory=None)
 
     with DeviceVolume(volume, device=device) as resident:
         return extract_by_spans(resident, level, make_spans, SPANS, **{"closed": True, "below": False} | how)
@@ -108,7 +108,7 @@ def test_surface_on_all_devices_has_the_arrays_of_one(device: Device) -> None:
     volume = make_noise()
     devices = [own for own in list_devices() if not (own.is_simulator or own.shortcoming)]
     with DeviceVolume(volume, device=device) as resident:
-        mesh = extract_by_spans(resident, 100, DeviceSpans(devices, None), SPANS, closed=True, below=False)
+        mesh = extract_by_spans(resident, 100, DeviceSpans(devices, memory=None), SPANS, closed=True, below=False)
     assert_same_arrays(mesh, extract_isosurface(volume, 100, device=device))
     assert all(own.driver in mesh.report["driver"] for own in devices)  # each has begun with a span
 
@@ -136,7 +136,7 @@ def test_surface_of_workers_has_the_arrays_of_one_extraction_when_a_worker_is_ki
     with open_cluster(LOCAL, [None]) as cluster, DeviceVolume(volume, device=device) as resident:
 
         def make_spans(grid: SampleGrid, spans: Sequence[Span]) -> Iterator[tuple[Span, SpanPart]]:
-            for number, made in enumerate(ClusterSpans(cluster, None)(grid, spans)):
+            for number, made in enumerate(ClusterSpans(cluster, memory=None)(grid, spans)):
                 if number == 1:
                     killed.extend(cluster.call_all(os.getpid))
                     os.kill(killed[0], signal.SIGKILL)

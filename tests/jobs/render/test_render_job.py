@@ -77,6 +77,7 @@ def test_least_depth_of_a_sphere_is_that_of_its_nearest_point_from_every_side(
     views_of_sphere: tuple[Path, Any], true_surface: Any
 ) -> None:
     folder, report = views_of_sphere
+    assert len(report["pictures"]) == 3
 
     for picture in report["pictures"]:
         camera = picture["camera"]
@@ -578,7 +579,7 @@ def draw_minimum(device: Any, tmp_path_factory: Any) -> Any:
 def test_minimum_shows_tissue_and_leaves_out_the_air_about_it(has_region: bool, draw_minimum: Any) -> None:
     drawn = draw_minimum(has_region=has_region)
 
-    assert np.nanmin(drawn.values) > -300.0  # tissue; measured 748 on, and air has -1000
+    assert np.nanmin(drawn.values) > 500.0  # the sphere; measured 748 on, and air has -1000
     assert drawn.report["volume"]["hu_range"] == [-1000.0, 1000.0]  # of the scan, which is read whole
     assert drawn.left_out["body"]
 

@@ -40,8 +40,9 @@ def test_a_sound_mesh_passes_every_gate_of_quality_that_was_measured():
 
 
 def test_a_gate_has_name_measure_bound_unit_verdict_and_text():
-    for gate in judge_quality(samples.torus()):
+    for gate in (gates := judge_quality(samples.torus())):
         assert set(gate) == {"name", "measured", "bound", "unit", "ok", "text"}
+    assert len(gates) == len(NAMES)
 
 
 def test_a_hole_fails_the_gate_closed_alone_and_says_how_many_edges_are_open():

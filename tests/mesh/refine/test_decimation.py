@@ -72,7 +72,7 @@ def test_a_sphere_loses_nine_of_ten_triangles_within_the_bound():
     volume_ml = 4 / 3 * np.pi * radius_mm**3 / 1000
     assert quality["volume_ml"] == pytest.approx(volume_ml, rel=tolerances.DECIMATED_VOLUME)
     outward = (small.vertices - FAR) / np.linalg.norm(small.vertices - FAR, axis=1, keepdims=True)
-    assert np.einsum("na,na->n", small.normals, outward).min() > 0.98  # within 12 degrees; measured 0.9998
+    assert np.einsum("na,na->n", small.normals, outward).min() > 0.999  # within 2.6 degrees; measured 0.9998
     said = small.report["refinement"]["decimate"]
     assert said["reached"] == pytest.approx(1 - small.triangle_count / sphere.triangle_count)
     of_an_octahedron_cut_six_times = 8 * 4**6
