@@ -99,12 +99,12 @@ def frames_in_the_middle_one_off(off_mm):
 
 
 def test_frame_within_a_twentieth_of_a_mm_of_the_line_is_placed():
-    assert place_frames(groups_of_all_frames(), frames_in_the_middle_one_off(0.0499), "a.dcm").slices == 3
+    assert place_frames(groups_of_all_frames(), frames_in_the_middle_one_off(off_mm=0.0499), "a.dcm").slices == 3
 
 
 def test_frame_further_than_a_twentieth_of_a_mm_off_the_line_is_refused():
     with refused(RefusedInputError, "a.dcm", 2.0, 0.05):  # the step, and how far the frame is off
-        place_frames(groups_of_all_frames(), frames_in_the_middle_one_off(0.0501), "a.dcm")
+        place_frames(groups_of_all_frames(), frames_in_the_middle_one_off(off_mm=0.0501), "a.dcm")
 
 
 def test_frames_micrometres_apart_and_uneven_are_refused():

@@ -87,7 +87,7 @@ def masks_with_links_out(tmp_path):
 
 
 def test_links_out_of_a_folder_of_masks_are_refused(masks_with_links_out):
-    with refused(RefusedInputError, "aorta.seg.nrrd", "liver.mha", 2):
+    with refused(RefusedInputError, "aorta.seg.nrrd", "liver.mha", 2):  # links
         read_labels(masks_with_links_out)
 
 
@@ -111,7 +111,7 @@ def test_links_between_masks_of_a_folder_are_left_out(tmp_path):
 def test_link_to_a_mask_that_is_missing_is_refused_by_its_name(tmp_path):
     folder = write_masks(tmp_path / "masks")
     (folder / "rib.nii.gz").symlink_to("../gone.nii.gz")
-    with refused(RefusedInputError, "rib.nii.gz", 1):
+    with refused(RefusedInputError, "rib.nii.gz", 1):  # link
         read_labels(folder, follow_links=True)
 
 

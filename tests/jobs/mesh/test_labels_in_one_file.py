@@ -27,7 +27,7 @@ AFFINE = np.diag((1.5, 1.5, 2.0, 1.0))
 
 
 @pytest.fixture(scope="module")
-def cubes_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def cubes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a CT of three cubes of 700 HU, ct.nii, and their labels, which have NAMES."""
     nibabel = pytest.importorskip("nibabel")
     folder = tmp_path_factory.mktemp("cubes")
@@ -41,18 +41,9 @@ def cubes_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def mesh_labels(cubes_folder: Path, device: Any, output: Path, *extra: str) -> int:
+def mesh_labels(cubes: Path, device: Any, output: Path, *extra: str) -> int:
     """Mesh the labels of the cubes at 300 HU to `output`, with further options; return the exit code."""
-    given = [
-        "mesh",
-        str(cubes_folder / "ct.nii"),
-        "-o",
-        str(output),
-        "--labels",
-        str(cubes_folder / "labels.nii.gz"),
-        "--hu",
-        "300",
-    ]
+    given = ["mesh", str(cubes / "ct.nii"), "-o", str(output), "--labels", str(cubes / "labels.nii.gz"), "--hu", "300"]
     return main([*given, "--device", str(device.index), "-q", *extra])
 
 
@@ -62,12 +53,12 @@ OBJECT_NAMES = ["left_right", "vertebrae_L2", "vertebrae_L3"]
 
 @pytest.mark.parametrize("kind", ["glb", "3mf"])
 def test_labels_in_one_file_are_named_objects_with_the_volumes_that_they_have_alone(
-    kind: str, cubes_folder: Path, device: Any, tmp_path: Path
+    kind: str, cubes: Path, device: Any, tmp_path: Path
 ) -> None:
     (tmp_path / "one").mkdir()
 
-    assert mesh_labels(cubes_folder, device, tmp_path / "one" / f"a.{kind}", "--one-file") == 0
-    assert mesh_labels(cubes_folder, device, tmp_path / "alone.stl") == 0
+    assert mesh_labels(cubes, device, tmp_path / "one" / f"a.{kind}", "--one-file") == 0
+    assert mesh_labels(cubes, device, tmp_path / "alone.stl") == 0
 
     assert [path.name for path in (tmp_path / "one").iterdir()] == [f"a.{kind}"]
     scene = trimesh.load(tmp_path / "one" / f"a.{kind}")
@@ -77,12 +68,8 @@ def test_labels_in_one_file_are_named_objects_with_the_volumes_that_they_have_al
         assert scene.geometry[name].volume == pytest.approx(alone.volume, rel=1e-4)  # both in mm, float32 and decimals
 
 
-def test_labels_in_one_glb_have_the_given_colour_and_different_ones(
-    cubes_folder: Path, device: Any, tmp_path: Path
-) -> None:
-    assert (
-        mesh_labels(cubes_folder, device, tmp_path / "a.glb", "--one-file", "--label-color", "L3 vertebra=#ff0000") == 0
-    )
+def test_labels_in_one_glb_have_the_given_colour_and_different_ones(cubes: Path, device: Any, tmp_path: Path) -> None:
+    assert mesh_labels(cubes, device, tmp_path / "a.glb", "--one-file", "--label-color", "L3 vertebra=#ff0000") == 0
 
     geometry = trimesh.load(tmp_path / "a.glb").geometry
     colors = {name: tuple(geometry[name].visual.material.baseColorFactor[:3]) for name in OBJECT_NAMES}
@@ -90,12 +77,8 @@ def test_labels_in_one_glb_have_the_given_colour_and_different_ones(
     assert len(set(colors.values())) == len(OBJECT_NAMES)
 
 
-def test_labels_in_one_3mf_have_the_given_colour_by_their_names(
-    cubes_folder: Path, device: Any, tmp_path: Path
-) -> None:
-    assert (
-        mesh_labels(cubes_folder, device, tmp_path / "a.3mf", "--one-file", "--label-color", "L3 vertebra=#ff0000") == 0
-    )
+def test_labels_in_one_3mf_have_the_given_colour_by_their_names(cubes: Path, device: Any, tmp_path: Path) -> None:
+    assert mesh_labels(cubes, device, tmp_path / "a.3mf", "--one-file", "--label-color", "L3 vertebra=#ff0000") == 0
 
     with zipfile.ZipFile(tmp_path / "a.3mf") as package:
         model = package.read("3D/3dmodel.model").decode()
@@ -103,40 +86,33 @@ def test_labels_in_one_3mf_have_the_given_colour_by_their_names(
     assert model.count("<object ") == model.count("<item ") == model.count("<base ") == len(OBJECT_NAMES)
 
 
-def test_hidden_label_is_no_object_of_one_file(cubes_folder: Path, device: Any, tmp_path: Path) -> None:
-    assert mesh_labels(cubes_folder, device, tmp_path / "a.glb", "--one-file", "--hide-label", "L3") == 0
+def test_hidden_label_is_no_object_of_one_file(cubes: Path, device: Any, tmp_path: Path) -> None:
+    assert mesh_labels(cubes, device, tmp_path / "a.glb", "--one-file", "--hide-label", "L3") == 0
     assert sorted(trimesh.load(tmp_path / "a.glb").geometry) == ["left_right", "vertebrae_L2"]
 
 
-def test_single_label_that_is_not_hidden_is_one_file_without_its_name(
-    cubes_folder: Path, device: Any, tmp_path: Path
-) -> None:
-    assert mesh_labels(cubes_folder, device, tmp_path / "b.stl", "--hide-label", "l2", "--hide-label", "9") == 0
+def test_single_label_that_is_not_hidden_is_one_file_without_its_name(cubes: Path, device: Any, tmp_path: Path) -> None:
+    assert mesh_labels(cubes, device, tmp_path / "b.stl", "--hide-label", "l2", "--hide-label", "9") == 0
     assert [path.name for path in tmp_path.iterdir()] == ["b.stl"]
 
 
-def test_components_of_labels_in_one_file_are_objects(cubes_folder: Path, device: Any, tmp_path: Path) -> None:
-    assert mesh_labels(cubes_folder, device, tmp_path / "a.glb", "--one-file", "--split") == 0
+def test_components_of_labels_in_one_file_are_objects(cubes: Path, device: Any, tmp_path: Path) -> None:
+    assert mesh_labels(cubes, device, tmp_path / "a.glb", "--one-file", "--split") == 0
 
     assert [path.name for path in tmp_path.iterdir()] == ["a.glb"]
     assert len(trimesh.load(tmp_path / "a.glb").geometry) == len(NAMES)  # each cube is one component
 
 
-def test_ply_of_a_coloured_label_has_the_colour_at_every_vertex(
-    cubes_folder: Path, device: Any, tmp_path: Path
-) -> None:
-    assert (
-        mesh_labels(cubes_folder, device, tmp_path / "a.ply", "--label", "L2", "--label-color", "vertebrae_L2=orange")
-        == 0
-    )
+def test_ply_of_a_coloured_label_has_the_colour_at_every_vertex(cubes: Path, device: Any, tmp_path: Path) -> None:
+    assert mesh_labels(cubes, device, tmp_path / "a.ply", "--label", "L2", "--label-color", "vertebrae_L2=orange") == 0
 
     colors = trimesh.load(tmp_path / "a.ply").visual.vertex_colors
     assert len(colors) > 0
     assert (colors == [255, 165, 0, 255]).all()  # orange of CSS
 
 
-def test_ply_of_a_label_without_a_given_colour_has_none(cubes_folder: Path, device: Any, tmp_path: Path) -> None:
-    assert mesh_labels(cubes_folder, device, tmp_path / "b.ply", "--label", "L2") == 0
+def test_ply_of_a_label_without_a_given_colour_has_none(cubes: Path, device: Any, tmp_path: Path) -> None:
+    assert mesh_labels(cubes, device, tmp_path / "b.ply", "--label", "L2") == 0
 
     header = (tmp_path / "b.ply").read_bytes().split(b"end_header")[0]
     assert b"red" not in header
@@ -154,12 +130,12 @@ def test_ply_of_a_label_without_a_given_colour_has_none(cubes_folder: Path, devi
     ],
 )
 def test_wrong_looks_of_labels_are_refused_in_one_line_and_write_nothing(
-    output: str, extra: list[str], words: str, cubes_folder: Path, device: Any, tmp_path: Path,
+    output: str, extra: list[str], words: str, cubes: Path, device: Any, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     monkeypatch.chdir(tmp_path)
 
-    assert mesh_labels(cubes_folder, device, Path(output), *extra) == 3
+    assert mesh_labels(cubes, device, Path(output), *extra) == 3
 
     (line,) = capsys.readouterr().err.splitlines()
     assert words in line
@@ -172,21 +148,21 @@ def test_unknown_colour_of_a_label_is_refused_by_the_settings() -> None:
 
 
 @pytest.mark.parametrize("option", ["--hide-label=L3", "--label-color=L3=red"])
-def test_look_of_a_label_without_a_label_map_is_refused(option: str, cubes_folder: Path, printed: Printer) -> None:
-    assert main(["mesh", str(cubes_folder / "ct.nii"), "-o", "a.glb", option]) == 3
+def test_look_of_a_label_without_a_label_map_is_refused(option: str, cubes: Path, printed: Printer) -> None:
+    assert main(["mesh", str(cubes / "ct.nii"), "-o", "a.glb", option]) == 3
     printed().assert_error("--labels", "FILE")
 
 
-def test_one_file_is_refused_where_there_is_one_mesh(cubes_folder: Path, printed: Printer) -> None:
-    assert main(["mesh", str(cubes_folder / "ct.nii"), "-o", "a.glb", "--one-file"]) == 3
+def test_one_file_is_refused_where_there_is_one_mesh(cubes: Path, printed: Printer) -> None:
+    assert main(["mesh", str(cubes / "ct.nii"), "-o", "a.glb", "--one-file"]) == 3
     printed().assert_error("--one-file")
 
 
 def test_obj_of_labels_has_named_objects_with_the_triangles_that_they_have_alone(
-    cubes_folder: Path, device: Any, tmp_path: Path
+    cubes: Path, device: Any, tmp_path: Path
 ) -> None:
-    assert mesh_labels(cubes_folder, device, tmp_path / "a.obj", "--one-file", "--label-color", "L3=#ff0000") == 0
-    assert mesh_labels(cubes_folder, device, tmp_path / "one.obj") == 0
+    assert mesh_labels(cubes, device, tmp_path / "a.obj", "--one-file", "--label-color", "L3=#ff0000") == 0
+    assert mesh_labels(cubes, device, tmp_path / "one.obj") == 0
 
     objects = read_objects(tmp_path / "a.obj")
     assert sorted(objects) == OBJECT_NAMES
@@ -197,9 +173,9 @@ def test_obj_of_labels_has_named_objects_with_the_triangles_that_they_have_alone
 
 
 def test_obj_of_labels_is_one_closed_mesh_for_a_reader_that_joins_its_objects(
-    cubes_folder: Path, device: Any, tmp_path: Path
+    cubes: Path, device: Any, tmp_path: Path
 ) -> None:
-    assert mesh_labels(cubes_folder, device, tmp_path / "a.obj", "--one-file") == 0
+    assert mesh_labels(cubes, device, tmp_path / "a.obj", "--one-file") == 0
 
     joined = trimesh.load(tmp_path / "a.obj", process=False)
     assert joined.is_watertight
@@ -230,11 +206,11 @@ def read_objects(path: Path) -> dict[str, tuple[Any, Any, Any]]:
 
 
 def test_vtp_of_labels_has_name_and_colour_of_the_label_of_each_triangle(
-    cubes_folder: Path, device: Any, tmp_path: Path
+    cubes: Path, device: Any, tmp_path: Path
 ) -> None:
     pyvista = pytest.importorskip("pyvista")
-    assert mesh_labels(cubes_folder, device, tmp_path / "a.vtp", "--one-file", "--label-color", "L3=#ff0000") == 0
-    assert mesh_labels(cubes_folder, device, tmp_path / "one.vtp") == 0
+    assert mesh_labels(cubes, device, tmp_path / "a.vtp", "--one-file", "--label-color", "L3=#ff0000") == 0
+    assert mesh_labels(cubes, device, tmp_path / "one.vtp") == 0
 
     together = pyvista.read(tmp_path / "a.vtp")
     names = list(together.field_data["PART_NAMES"])
@@ -264,10 +240,10 @@ def read_names(path: Path) -> list[str]:
     ids=["components", "iso values"],
 )
 def test_components_and_iso_values_without_labels_are_objects_of_one_file(
-    kind: str, options: list[str], names: list[str], cubes_folder: Path, device: Any, tmp_path: Path
+    kind: str, options: list[str], names: list[str], cubes: Path, device: Any, tmp_path: Path
 ) -> None:
     output, report = tmp_path / f"a.{kind}", tmp_path / "a.json"
-    command = ["mesh", str(cubes_folder / "ct.nii"), "-o", str(output), "--device", str(device.index), "-q", *options]
+    command = ["mesh", str(cubes / "ct.nii"), "-o", str(output), "--device", str(device.index), "-q", *options]
 
     assert main([*command, "--one-file", "--report", str(report)]) == 0
 

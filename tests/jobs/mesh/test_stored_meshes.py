@@ -125,6 +125,7 @@ def test_scan_that_is_no_dicom_cannot_be_stored(archive: Archive, scan: Path, tm
     volume.save(tmp_path / "grid" / "ct.nrrd")
 
     assert store(tmp_path / "grid" / "ct.nrrd", tmp_path, archive.study) == 3
+    assert [path.name for path in tmp_path.iterdir()] == ["grid"]
 
 
 def test_same_mesh_of_the_same_scan_has_the_same_uid_and_another_mesh_another(scan: Path) -> None:

@@ -103,8 +103,8 @@ def test_views_fit_scales_of_their_own_which_zoom_makes_one(
     largest = max(fitted.values())
     assert min(fitted.values()) < 0.95 * largest  # measured 0.76: they differ
     for view, pixel_mm in fitted.items():
-        alone = make_pictures(sphere, files, replace(settings, views=(view,), zoom=pixel_mm / largest))
-        (picture,) = alone["pictures"]
+        zoomed = replace(settings, views=(view,), zoom=pixel_mm / largest)
+        (picture,) = make_pictures(sphere, files, zoomed)["pictures"]
         assert picture["pixel_mm"] == pytest.approx(largest, rel=1e-9)  # float64
 
 
@@ -514,11 +514,8 @@ def sheet_settings(device: Any, sphere: Path, tmp_path: Path) -> RenderSettings:
 def test_report_of_a_sheet_has_its_size_slices_and_colours_of_labels(
     sheet_settings: RenderSettings, sphere: Path, tmp_path: Path
 ) -> None:
-    assert (sheet_settings.mode, sheet_settings.style.is_sheet, sheet_settings.size_used) == (
-        "slice",
-        True,
-        (1600, 1200),
-    )
+    assert (sheet_settings.mode, sheet_settings.style.is_sheet) == ("slice", True)
+    assert sheet_settings.size_used == (1600, 1200)
 
     report = make_pictures(sphere, PictureFiles(tmp_path / "a.png"), sheet_settings)
 
@@ -578,7 +575,6 @@ def draw_minimum(device: Any, tmp_path_factory: Any) -> Any:
 @pytest.mark.parametrize("has_region", [False, True], ids=["whole", "region"])
 def test_minimum_shows_tissue_and_leaves_out_the_air_about_it(has_region: bool, draw_minimum: Any) -> None:
     drawn = draw_minimum(has_region=has_region)
-
     assert np.nanmin(drawn.values) > 500.0  # the sphere; measured 748 on, and air has -1000
     assert drawn.report["volume"]["hu_range"] == [-1000.0, 1000.0]  # of the scan, which is read whole
     assert drawn.left_out["body"]
@@ -589,13 +585,11 @@ def test_minimum_reports_and_warns_that_what_is_outside_of_a_region_is_left_out(
     has_region: bool, draw_minimum: Any
 ) -> None:
     drawn = draw_minimum(has_region=has_region)
-
     assert drawn.left_out["region"] == has_region
     assert any("is left out:" in text for text in drawn.report["warnings"]) == has_region
 
 
 def test_minimum_with_a_region_leaves_out_more_than_without(draw_minimum: Any) -> None:
     whole, region = draw_minimum(has_region=False), draw_minimum(has_region=True)
-
     assert 0.5 < whole.left_out["share"] < region.left_out["share"] < 1.0  # measured 0.958 and 0.961
     assert np.isfinite(region.values).sum() > 20  # pixels that show the region

@@ -199,12 +199,12 @@ def test_the_gate_on_label_volume_measures_the_change_in_percent():
 
 
 def test_a_failed_gate_on_label_volume_says_both_volumes_and_the_advice():
-    gate = judge_label_volume(24.0, LABEL_ML, "fill it")
+    gate = judge_label_volume(24.0, LABEL_ML, advice="fill it")
     assert gate["text"] == "the mesh has 24 ml, the label 63 ml (-61.9 %, at most 15 % either way): fill it"
 
 
 def test_a_passed_gate_on_label_volume_gives_no_advice():
-    assert "fill it" not in judge_label_volume(LABEL_ML, LABEL_ML, "fill it")["text"]
+    assert "fill it" not in judge_label_volume(LABEL_ML, LABEL_ML, advice="fill it")["text"]
 
 
 def test_label_volume_of_an_open_mesh_is_not_judged():

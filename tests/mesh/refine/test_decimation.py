@@ -64,7 +64,7 @@ def check_within(mesh: Mesh, before: Mesh, bound: float) -> None:
 def test_a_sphere_loses_nine_of_ten_triangles_within_the_bound():
     radius_mm, bound_mm = 20.0, 0.1
     sphere = Mesh(*samples.sphere(FAR, radius=radius_mm, rounds=6), report={"iso_value_hu": 300.0})
-    small = decimate_mesh(sphere, 0.9, bound_mm)
+    small = decimate_mesh(sphere, fraction=0.9, max_deviation_mm=bound_mm)
     assert small.triangle_count == pytest.approx(0.1 * sphere.triangle_count, abs=2)  # an edge takes two
     check_within(small, sphere, bound_mm)
     quality = small.quality()
@@ -85,7 +85,7 @@ def test_the_bound_stops_the_decimation():
     sphere = Mesh(*samples.sphere(FAR, radius=20.0, rounds=5))
     reached = []
     for bound in (0.002, 0.04, 0.2):
-        small = decimate_mesh(sphere, 0.97, bound)
+        small = decimate_mesh(sphere, fraction=0.97, max_deviation_mm=bound)
         check_within(small, sphere, bound)
         reached.append(small.report["refinement"]["decimate"]["reached"])
     narrow, middle, wide = reached
@@ -95,7 +95,7 @@ def test_the_bound_stops_the_decimation():
 
 def test_a_torus_stays_a_torus():
     torus = Mesh(*samples.torus(rings=120, sides=48))
-    small = decimate_mesh(torus, 0.8, max_deviation_mm=0.3)
+    small = decimate_mesh(torus, fraction=0.8, max_deviation_mm=0.3)
     quality = small.quality()
     assert (quality["closed"], quality["manifold"], quality["genus"]) == (True, True, 1)
     assert quality["triangles"] <= 0.2 * torus.triangle_count  # measured 2,302 of 11,520
@@ -108,7 +108,7 @@ def test_no_triangle_of_either_surface_is_further_than_the_bound(seed):
     rough = noise_surface(seed, (24, 25, 15))
     smooth = smooth_mesh(rough)
     check_within(smooth, rough, DEFAULT_BOUND_MM)
-    check_within(decimate_mesh(smooth, 0.9), smooth, DEFAULT_BOUND_MM)
+    check_within(decimate_mesh(smooth, fraction=0.9), smooth, DEFAULT_BOUND_MM)
 
 
 @pytest.mark.parametrize("seed", daily(1, range(4)))
@@ -149,7 +149,7 @@ def test_each_component_keeps_its_volume():
     outer, (corners, faces) = samples.sphere(FAR, radius=10.0, rounds=5), samples.sphere(FAR, radius=8.0, rounds=4)
     other = samples.sphere(FAR + (40.0, 0, 0), radius=3.0, rounds=4)
     mesh, bound_mm = Mesh(*samples.join((corners, faces[:, ::-1]), outer, other)), 0.4
-    small = decimate_mesh(mesh, 0.8, bound_mm)
+    small = decimate_mesh(mesh, fraction=0.8, max_deviation_mm=bound_mm)
     check_within(small, mesh, bound_mm)
     for part, before in zip(split_components(small), split_components(mesh), strict=True):
         assert part.triangle_count < before.triangle_count
@@ -195,8 +195,8 @@ def test_a_mesh_of_one_vertex_or_triangle_fewer_than_is_refused_keeps_its_bound(
 
 
 def test_an_open_surface_keeps_its_border():
-    mesh = noise_surface(7, closed=False)
-    before, small = mesh.quality(), decimate_mesh(mesh, 0.5)
+    mesh = noise_surface(seed=7, closed=False)
+    before, small = mesh.quality(), decimate_mesh(mesh, fraction=0.5)
     after = small.quality()
     assert small.triangle_count < mesh.triangle_count
     assert before["boundary_edges"] == after["boundary_edges"] > 0
@@ -206,7 +206,7 @@ def test_an_open_surface_keeps_its_border():
 @pytest.mark.parametrize("seed", [4, 7])
 def test_each_speck_keeps_its_volume(seed):
     mesh = noise_surface(seed)
-    small = decimate_mesh(mesh, 0.6)
+    small = decimate_mesh(mesh, fraction=0.6)
     assert small.triangle_count < 0.7 * mesh.triangle_count  # measured 0.63 and 0.65: the bound ends it before 0.4
     before, after = (np.sort(volumes_of(each)) for each in (mesh, small))
     large = np.abs(before) > 0.1  # of smaller ones the rounding of coordinates is as large
@@ -215,7 +215,7 @@ def test_each_speck_keeps_its_volume(seed):
 
 def test_nothing_is_removed_where_the_bound_allows_nothing():
     sphere = Mesh(*samples.sphere(rounds=1))
-    facts = decimate_mesh(sphere, 0.5, max_deviation_mm=1e-3).report["refinement"]["decimate"]
+    facts = decimate_mesh(sphere, fraction=0.5, max_deviation_mm=1e-3).report["refinement"]["decimate"]
     assert (facts["reached"], facts["ended_by"], facts["vertices_taken_back"]) == (0.0, "bound", 0)
 
 
