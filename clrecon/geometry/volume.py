@@ -347,6 +347,29 @@ class Volume(BaseVolume, ShownAsHtml):
         given = {"iso_value": iso_value, "device": device}
         public_function("show")(self, **{name: value for name, value in given.items() if value is not None})
 
+    @explains_arguments
+    def view(self, iso_value: float | Literal["auto"] | None = None, *, device: Any = None) -> Any:
+        """Return the page of ``clrecon view``, which a notebook shows in the cell; see `clrecon.show`.
+
+        Parameters
+        ----------
+        iso_value : float or "auto", optional
+            HU of the surface at the start; without one the page begins with the bone by volume rendering.
+        device : Device, str or int, optional
+            See `clrecon.device`; None is the best of the machine.
+
+        Returns
+        -------
+        LivePage
+            The page, with ``address``, ``open()`` and ``close()``.
+
+        Raises
+        ------
+        DeviceError
+            The device does not exist.
+        """
+        return public_function("show")(self, iso_value=iso_value, device=device, page=True)
+
     def __repr__(self) -> str:
         ni, nj, nk = self.shape_ijk
         di, dj, dk = self.spacing

@@ -1,10 +1,15 @@
-"""What a notebook shows of meshes, volumes, clouds, label maps and listings: HTML that works offline."""
+"""What a notebook shows: HTML that works offline, and `LivePage`, the page of a view that this process serves."""
 
 from __future__ import annotations
 
 import base64
+import threading
+import weakref
 from collections.abc import Iterable, Sequence
+from functools import partial
 from html import escape
+from pathlib import Path
+from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,15 +21,20 @@ from clrecon.geometry import Volume
 from clrecon.points import PointCloud
 from clrecon.reading.common.source_facts import SeriesListing
 from clrecon.system.arguments import ViewName
+from clrecon.system.base_classes import Closing
 from clrecon.system.log import get_logger
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
+    from clrecon.jobs.view import ViewSettings
     from clrecon.labels import LabelMap
     from clrecon.mesh import Mesh
     from clrecon.points import PointCloud
     from clrecon.reading.common.source_facts import SeriesListing
     from clrecon.rendering import Rendering
+    from clrecon.viewer.model.objects import ShownObject
+    from clrecon.viewer.session.opening import OpenedView
+    from clrecon.viewer.web.server import WebServer
 
 log = get_logger(__name__)
 
@@ -32,6 +42,10 @@ _MOST_PAGE_BYTES = 2_000_000
 """Of a page within a notebook, which keeps all that it shows."""
 
 _PAGE_HEIGHT = 480
+_LIVE_HEIGHT = 640
+_PATIENCE_S = 10.0
+"""Until a port of this machine answers, or is given up."""
+
 _PICTURE_SIZE = (640, 480)
 _SLICE_SIZE = (280, 280)
 _MOST_ROWS = 40
@@ -154,3 +168,71 @@ def _table(heads: Sequence[str], rows: Sequence[Iterable[object]], colors: Seque
         lines.append("<tr>" + "".join(f"<td>{mark * (n == 0)}{cell}</td>" for n, cell in enumerate(cells)) + "</tr>")
     more = f"<p>and {len(rows) - _MOST_ROWS:,} more</p>" if len(rows) > _MOST_ROWS else ""
     return f"<table>{''.join(lines)}</table>{more}"
+
+
+class LivePage(Closing):
+    """The page of ``clrecon view`` in a cell of a notebook, or in a browser of this machine, until it is closed.
+
+    It ends with the process at the latest.  A notebook that is opened later shows the picture of the beginning.
+
+    Attributes
+    ----------
+    address : str
+        For a browser on this machine; whoever knows it sees the scan.
+    """
+
+    def __init__(self, objects: Sequence[ShownObject], settings: ViewSettings):
+        from clrecon.viewer.session.opening import OpenedView
+        from clrecon.viewer.web.server import WebServer
+
+        self._view = OpenedView(objects, settings)
+        try:
+            self._server = WebServer(is_framed=True)
+            self.address, self.port = self._server.address, self._server.port
+            self._picture = self._draw()
+            folders: SimpleQueue[Path] = SimpleQueue()
+            serve = partial(self._server.serve, self._view.session, folders.put)
+            self._thread = threading.Thread(target=serve, name="clrecon-live-page", daemon=True)
+            self._thread.start()
+            self._folder = folders.get(timeout=_PATIENCE_S)
+        except BaseException:
+            self._view.close()
+            raise
+        self._end = weakref.finalize(self, _end_page, self._server, self._thread, self._view)
+
+    def close(self) -> None:
+        self._end()
+
+    def open(self) -> None:
+        """Open the page in the browser of this machine."""
+        from clrecon.viewer.web.server import open_browser
+
+        open_browser(self.address, self._folder)
+
+    def __repr__(self) -> str:
+        if not self._end.alive:
+            return "LivePage(closed)"
+        return f"LivePage(port {self.port} of this machine: open() shows it in the browser)"
+
+    def _repr_html_(self) -> str:
+        frame = ""
+        if self._end.alive:
+            frame = (
+                f'<iframe src="{escape(self.address)}" title="{escape(repr(self))}" width="100%"'
+                f' height="{_LIVE_HEIGHT}" style="border: 0"></iframe>'
+            )
+        return (
+            f"{frame}<details{'' if frame else ' open'}><summary>Picture of the page as it begins; the page itself is"
+            f" served to this machine alone, while its program runs</summary>{self._picture}</details>"
+        )
+
+    def _draw(self) -> str:
+        model = self._view.model(_PICTURE_SIZE[0] / _PICTURE_SIZE[1])
+        return _image(self._view.painter.picture(model.state, _PICTURE_SIZE))
+
+
+def _end_page(server: WebServer, thread: threading.Thread, view: OpenedView) -> None:
+    server.stop()
+    thread.join(_PATIENCE_S)
+    with server:  # its port is free again
+        view.close()

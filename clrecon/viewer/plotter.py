@@ -15,14 +15,18 @@ import numpy as np
 from clrecon.anatomy.iso_choice import settle_level
 from clrecon.errors import NoSurfaceError
 from clrecon.geometry import Volume
+from clrecon.geometry.iso_rule import checked_iso_value
+from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.view import ViewSettings
 from clrecon.jobs.view.inputs import check_view_settings
+from clrecon.operators import take_device
 from clrecon.operators.surface.cortex_mesh import fit_cortex
 from clrecon.operators.surface.extract import SurfaceExtractor
 from clrecon.operators.surface.label_masks import extract_label_masks
 from clrecon.rendering.pictures.label_style import distinct_colors
 from clrecon.rendering.pictures.object_looks import MESH_COLORS, MeshLook
 from clrecon.rendering.pictures.pillow import load_pillow
+from clrecon.rendering.pictures.style_checks import flag
 from clrecon.rendering.pictures.styles import DEFAULT_ISO_VALUE
 from clrecon.rendering.views.directions import DIRECTIONS
 from clrecon.system.display import Display, DisplayProbe, NoDisplayError
@@ -44,6 +48,7 @@ if TYPE_CHECKING:
     from clrecon.labels import LabelMap
     from clrecon.mesh import Mesh
     from clrecon.points import PointCloud
+    from clrecon.viewer.notebook import LivePage
 
 SIZE = (1100, 850)
 BONE = (0.90, 0.86, 0.78)
@@ -61,9 +66,12 @@ _LISTEN_MS = 100
 
 
 def show(
-    *shown: Volume | Mesh | PointCloud | LabelMap, iso_value: float | Literal["auto"] | None = None, device: Any = None
-) -> None:
-    """Show objects in a window of pyvista, until it is closed.
+    *shown: Volume | Mesh | PointCloud | LabelMap,
+    iso_value: float | Literal["auto"] | None = None,
+    device: Any = None,
+    page: bool = False,
+) -> LivePage | None:
+    """Show objects in a window of pyvista, until it is closed, or in the page of ``clrecon view``.
 
     A plain ``pyvista.Plotter``: drag turns, Shift and drag pans, the wheel zooms.  A slider sets the iso value of
     volumes, whose surfaces are extracted on the device; ``t`` fits them to the bone, ``T`` colours those by thickness
@@ -78,6 +86,13 @@ def show(
         HU at the start, 200 by default; "auto" is that of `choose_iso_value` of the first volume.
     device : Device, str or int, optional
         For volumes and label maps, see `clrecon.device`; None is the best of the machine.
+    page : bool
+        In place of a window return the page, which a notebook shows in the cell: modes, slices, measures, parts.
+
+    Returns
+    -------
+    LivePage or None
+        The page has ``address``, `open` and `close`; see ``clrecon.viewer.notebook``.
 
     Raises
     ------
@@ -87,10 +102,17 @@ def show(
         The device does not exist.
     """
     level, _ = settle_level(next((each for each in shown if isinstance(each, Volume)), None), iso_value)
+    if flag("page", page):
+        from clrecon.viewer.notebook import LivePage
+
+        level = None if level is None else checked_iso_value(level)
+        scan = MeshSettings(iso_value=level, device=str(take_device(device).index))
+        return LivePage(show_objects(shown), ViewSettings(scan=scan))
     with DisplayProbe() as probe:
         display = _wait_for_display(probe)
     with open_plotter(show_objects(shown), iso_value=level, device=device) as plotter:
         _run(plotter, display)
+    return None
 
 
 def show_inputs(

@@ -12,10 +12,10 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 98_949,
+    "lines": 99_084,
     "modules": 433,
     "small_modules_with_one_reader": 8,
-    "docstrings_with_raises": 136,
+    "docstrings_with_raises": 137,
     "options_in_several_files": 8,
     "modules_with_own_all": 0,
 }

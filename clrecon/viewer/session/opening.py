@@ -44,11 +44,11 @@ def choose_iso(objects: Sequence[ShownObject], scan: MeshSettings, progress: Pro
 
 
 class OpenedView(Closing):
-    """What the views of some inputs share, and what has to be `said` of the inputs; a context manager."""
+    """What the views of some objects share, and what has to be `said` of them; a context manager."""
 
-    def __init__(self, inputs: Sequence[str | Path], settings: ViewSettings, progress: Progress = ignore_progress):
+    def __init__(self, objects: Sequence[ShownObject], settings: ViewSettings, progress: Progress = ignore_progress):
         scan = settings.scan
-        self.objects = read_objects(inputs, settings, progress)
+        self.objects = list(objects)
         self.said = list(dict.fromkeys(chain(*(each.said for each in self.objects))))
         self._iso_value = choose_iso(self.objects, scan, progress)
         self._space, self._keep_ids = scan.space, scan.keep_ids
@@ -114,7 +114,8 @@ def open_view(
     """Read inputs for a view; the settings say how, and with which iso value it begins."""
     settings = settings or ViewSettings()
     check_view_settings(settings)
-    return OpenedView(inputs, settings, progress or ignore_progress)
+    progress = progress or ignore_progress
+    return OpenedView(read_objects(inputs, settings, progress), settings, progress)
 
 
 def draw_view(

@@ -88,16 +88,21 @@ class Page(NamedTuple):
     policy: str
 
 
+_NOTEBOOKS = "http://127.0.0.1:* http://localhost:* vscode-webview:"
 _VIEW, _START = ("page", ("page.js", "panes.js")), ("start", ("start.js",))
 """Pages: the name of their document and style, and their scripts."""
 
 
-def compose_page(host: str, *, start: bool = False) -> Page:
-    """Return the page for a server under `host`, with port: own script and style, pictures, this server alone."""
+def compose_page(host: str, *, start: bool = False, is_framed: bool = False) -> Page:
+    """Return the page for a server under `host`, with port: own script and style, pictures, this server alone.
+
+    is_framed: Notebooks of this machine may show it in a frame.
+    """
     content, script, style = _compose(*(_START if start else _VIEW))
+    frames = _NOTEBOOKS if is_framed else "'none'"
     policy = (
         f"default-src 'none'; script-src '{script}'; style-src '{style}'; img-src blob: data:; connect-src 'self'"
-        f" ws://{host}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+        f" ws://{host}; base-uri 'none'; form-action 'none'; frame-ancestors {frames}"
     )
     return Page(content, policy)
 
@@ -196,6 +201,7 @@ class WebServer:
     """The server of a view, a context manager; its port is taken at once, its `address` holds the secret.
 
     start: What the start page drops and opens; None: there is a view from the beginning.
+    is_framed: The page may stand in a frame of a notebook of this machine.
     """
 
     def __init__(
@@ -205,8 +211,10 @@ class WebServer:
         save_as: Sequence[str] = (),
         wrote: Callable[[str], object] = ignore_line,
         start: StartRoom | None = None,
+        is_framed: bool = False,
     ) -> None:
         self._start = start
+        self._is_framed = is_framed
         self._save_as, self._wrote = save_as, wrote
         self._listener = bind_port(port)
         self._secret = make_secret()
@@ -309,7 +317,7 @@ class WebServer:
         from aiohttp import web
 
         start = self._start is not None and (self._start.view is None or "start" in request.query)
-        page = compose_page(request.headers["Host"], start=start)
+        page = compose_page(request.headers["Host"], start=start, is_framed=self._is_framed)
         return web.Response(
             body=page.content,
             content_type="text/html",
@@ -397,7 +405,6 @@ async def _add_header(request: web.Request, response: web.StreamResponse) -> Non
             "Cache-Control": "no-store",
             "Referrer-Policy": "no-referrer",
             "X-Content-Type-Options": "nosniff",
-            "X-Frame-Options": "DENY",
             "Cross-Origin-Opener-Policy": "same-origin",
             "Cross-Origin-Resource-Policy": "same-origin",
         }

@@ -22,7 +22,7 @@ from clrecon.system.light_dataclass import dataclass
 from clrecon.system.log import get_logger
 from clrecon.system.text import escape_text
 from clrecon.viewer.session.choices import Choice, checked_choice, find_choices, find_saved_view
-from clrecon.viewer.session.opening import OpenedView
+from clrecon.viewer.session.opening import OpenedView, open_view
 from clrecon.viewer.session.session import ViewSession
 
 if TYPE_CHECKING:
@@ -124,7 +124,7 @@ class StartRoom(Closing):
         settings = replace(self.settings, scan=replace(self.settings.scan, **given))
         if saved is not None:
             settings = replace(settings, state=str(saved))
-        view = OpenedView([choice.path], settings, self._tell)
+        view = open_view([choice.path], settings, progress=self._tell)
         try:
             first = view.session()  # a saved view that does not fit is refused here
         except ClreconError:
