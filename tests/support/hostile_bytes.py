@@ -198,23 +198,9 @@ def pydicom_seeds() -> dict[str, Seed]:
 
 # --- what is done to them ---
 VRS = [
-    b"SQ",
-    b"UN",
-    b"OB",
-    b"OW",
-    b"US",
-    b"UL",
-    b"DS",
-    b"IS",
-    b"UI",
-    b"LO",
-    b"FD",
-    b"AT",
-    b"PN",
-    b"\0\0",
-    b"zz",
-    b"\xff\xff",
-]
+    b"SQ", b"UN", b"OB", b"OW", b"US", b"UL", b"DS", b"IS", b"UI", b"LO", b"FD", b"AT", b"PN", b"\0\0",
+    b"zz", b"\xff\xff",
+]  # fmt: skip
 LENGTHS = [0, 1, 2, 3, 5, 7, 0x7FFF, 0xFFFE, 0xFFFF, 0x10000, 0x7FFFFFFF, 0xFFFFFFFE, 0xFFFFFFFF]
 TEXTS = [
     b"", b" ", b"\0", b"0", b"-1", b"nan", b"inf", b"1e400", b"-1e-400", b"1,5", b"abc", b"1\\2", b"0\\0", b"\\" * 9,

@@ -292,10 +292,8 @@ def add_frame(*, zeros: bool = False, number: int | None = None) -> Callable[[An
         pixels = ds.pixel_array.astype(np.uint8)
         extra = pixels[0] * 0 if zeros else np.where(pixels[0] > 0, number or 1, 0).astype(np.uint8)
         every = np.concatenate([pixels, extra[None]])
-        ds.PerFrameFunctionalGroupsSequence = [
-            *ds.PerFrameFunctionalGroupsSequence,
-            ds.PerFrameFunctionalGroupsSequence[0],
-        ]
+        groups = ds.PerFrameFunctionalGroupsSequence
+        ds.PerFrameFunctionalGroupsSequence = [*groups, groups[0]]
         ds.NumberOfFrames = len(every)
         data = np.packbits(every.ravel(), bitorder="little") if ds.BitsAllocated == 1 else every
         ds.PixelData = data.tobytes() + b"\0" * (data.size % 2)
@@ -361,13 +359,9 @@ def add_rt(
         normal /= np.linalg.norm(normal)
         contours, wanted = [], np.zeros((5, 20, 24), bool)
         for i0, j0, i1, j1 in boxes:
-            ends = [
-                (i0 - inset, j0 - inset),
-                (i1 + inset, j0 - inset),
-                (i1 + inset, j1 + inset),
-                (i0 - inset, j1 + inset),
-            ]
-            points = volume.ijk_to_lps([(i, j, 2) for i, j in ends]) + off_mm * normal
+            left, right, top, bottom = i0 - inset, i1 + inset, j0 - inset, j1 + inset
+            ends = [(left, top, 2), (right, top, 2), (right, bottom, 2), (left, bottom, 2)]
+            points = volume.ijk_to_lps(ends) + off_mm * normal
             contours.append((kind, points))
             box = np.zeros_like(wanted)
             box[2, j0 : j1 + 1, i0 : i1 + 1] = True
@@ -420,30 +414,14 @@ def add_folder(name: str, verdict: str = EXACT, words: str = "", *, last: Callab
 add_folder("NIfTI and NRRD")
 add_folder("values 0 and 255", value=255)
 add_folder("masks that overlap", WARNED, "the masks overlap in 42 voxels", second=slice(1, 3))
-add_folder(
-    "two grids",
-    REFUSED,
-    "lie on two grids",
-    last=lambda path: write_nifti(path / "c.nii", make_labels() > 0, OBLIQUE, dtype="u1"),
-)
-add_folder(
-    "a label map among them",
-    REFUSED,
-    "holds several labels",
-    last=lambda path: write_nifti(path / "c.nii", make_labels(), STRAIGHT),
-)
-add_folder(
-    "two masks of one name",
-    REFUSED,
-    "has two masks of one name",
-    last=lambda path: write_nifti(path / "a.nii", make_labels(), STRAIGHT),
-)
-add_folder(
-    "DICOM among them",
-    REFUSED,
-    "is a folder with DICOM files",
-    last=lambda path: dicom_series.write_series(path / "", dicom_series.Plan(shape=(2, 4, 5))),
-)
+add_folder("two grids", REFUSED, "lie on two grids",
+           last=lambda path: write_nifti(path / "c.nii", make_labels() > 0, OBLIQUE, dtype="u1"))  # fmt: skip
+add_folder("a label map among them", REFUSED, "holds several labels",
+           last=lambda path: write_nifti(path / "c.nii", make_labels(), STRAIGHT))  # fmt: skip
+add_folder("two masks of one name", REFUSED, "has two masks of one name",
+           last=lambda path: write_nifti(path / "a.nii", make_labels(), STRAIGHT))  # fmt: skip
+add_folder("DICOM among them", REFUSED, "is a folder with DICOM files",
+           last=lambda path: dicom_series.write_series(path / "", dicom_series.Plan(shape=(2, 4, 5))))  # fmt: skip
 add_folder("other files among them", last=lambda path: (path / "statistics.json").write_text("{}"))
 
 

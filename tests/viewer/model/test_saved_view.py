@@ -158,6 +158,10 @@ def test_view_of_other_inputs_is_refused_with_both_kinds() -> None:
         restore_view(saved, make_model(SCAN(), LABELS()))
 
 
+CIRCLE = {"kind": "circle", "name": "a", "thickness_mm": 0}
+PART = {"key": "2", "kind": "mesh", "number": 0, "inside_lps_mm": None, "color": None, "opacity": 1, "visible": 1}
+CAMERA = {"up_lps": [0, 0, 1], "view_angle_deg": None, "parallel_scale_mm": 9}
+
 DAMAGED: dict[str, dict[str, Any]] = {
     "mode unknown": {"mode": "x-ray vision"},
     "iso value outside of the slider": {"iso_value_hu": 1e9},
@@ -175,30 +179,10 @@ DAMAGED: dict[str, dict[str, Any]] = {
     "clip without a share": {"clips": [{"direction": "left", "flipped": False}]},
     "measure of one point": {"measures": [{"kind": "distance", "name": "a", "points_lps_mm": [[0, 0, 0]]}]},
     "measure of an unknown kind": {"measures": [{"kind": "area", "name": "a", "points_lps_mm": []}]},
-    "circle of two radii": {
-        "measures": [
-            {"kind": "circle", "name": "a", "points_lps_mm": [[0, 0, 0], [5, 0, 0], [0, 6, 0]], "thickness_mm": 0}
-        ]
-    },
-    "part of no object": {
-        "parts": [
-            {"key": "7", "kind": "mesh", "number": 0, "inside_lps_mm": None, "color": None, "opacity": 1, "visible": 0}
-        ]
-    },
-    "opacity above 1": {
-        "parts": [
-            {"key": "2", "kind": "mesh", "number": 0, "inside_lps_mm": None, "color": None, "opacity": 2, "visible": 1}
-        ]
-    },
-    "camera in its focal point": {
-        "camera": {
-            "position_lps_mm": [0, 0, 0],
-            "focal_point_lps_mm": [0, 0, 0],
-            "up_lps": [0, 0, 1],
-            "view_angle_deg": None,
-            "parallel_scale_mm": 9,
-        }
-    },
+    "circle of two radii": {"measures": [{**CIRCLE, "points_lps_mm": [[0, 0, 0], [5, 0, 0], [0, 6, 0]]}]},
+    "part of no object": {"parts": [{**PART, "key": "7"}]},
+    "opacity above 1": {"parts": [{**PART, "opacity": 2}]},
+    "camera in its focal point": {"camera": {**CAMERA, "position_lps_mm": [0, 0, 0], "focal_point_lps_mm": [0, 0, 0]}},
     "camera missing": {"camera": None},
     "clips that are no list": {"clips": 3},
 }
