@@ -29,11 +29,9 @@ def sheet(nx: int, ny: int, *, corner: tuple[float, float, float], thickness: fl
 
 SMALL_BLOCK, SHEET, LARGE_BLOCK, OTHER_BLOCK = range(4)
 PARTS = (
-    block(300, corner=(0, 0, 0)),
-    sheet(40, 30, corner=(100, 0, 0)),
-    block(700, corner=(0, 100, 0)),
+    block(300, corner=(0, 0, 0)), sheet(40, 30, corner=(100, 0, 0)), block(700, corner=(0, 100, 0)),
     block(300, corner=(0, 0, 100)),
-)
+)  # fmt: skip
 LABELS = np.concatenate([np.full(len(part), number) for number, part in enumerate(PARTS)])
 
 

@@ -17,12 +17,8 @@ def make_cloud():
     rng = np.random.default_rng(5)
     normals = rng.normal(size=(count, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return clrecon.PointCloud(
-        rng.uniform(-50, 50, (count, 3)),
-        normals=normals,
-        hu=rng.integers(-900, 900, count),
-        labels=np.arange(count) - 1,
-    )
+    points, hu = rng.uniform(-50, 50, (count, 3)), rng.integers(-900, 900, count)
+    return clrecon.PointCloud(points, normals=normals, hu=hu, labels=np.arange(count) - 1)
 
 
 def assert_same(cloud, other):

@@ -185,11 +185,7 @@ import os; os._exit(0)
 @pytest.mark.skipif(sys.platform != "linux", reason="guards of memory are made with Linux's calls")
 def test_no_voxel_beyond_the_volume_is_read(windowed):
     shapes = ["128,128,32", "512,64,16", "64,64,128", "2,512,512", "512,2,512"]
-    done = subprocess.run(
-        [sys.executable, "-c", BETWEEN_GUARDS, str(windowed.index), *shapes],
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
+    command = [sys.executable, "-c", BETWEEN_GUARDS, str(windowed.index), *shapes]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     seen = [f"({shape.replace(',', ', ')}) seen True" for shape in shapes]
     assert (done.returncode, done.stdout.splitlines()) == (0, seen), done.stderr[-2000:]

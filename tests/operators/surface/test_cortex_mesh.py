@@ -136,14 +136,11 @@ def test_hidden_walls_follow_their_fitted_neighbours_three_vertices_far_and_othe
     is_fitted = (columns < 3).ravel()
     unused = np.full(81, np.nan, np.float32)
     fit = CortexFit(
-        constants=None,
-        own_cortex_hu=(),
-        states=np.where(is_fitted, FITTED, _BADLY_FITTED).astype(np.uint8),
-        hidden=~is_fitted & (rows < 5).ravel(),
-        shift_mm=np.where(is_fitted, -0.5, 9.0).astype(np.float32),
+        constants=None, own_cortex_hu=(), states=np.where(is_fitted, FITTED, _BADLY_FITTED).astype(np.uint8),
+        hidden=~is_fitted & (rows < 5).ravel(), shift_mm=np.where(is_fitted, -0.5, 9.0).astype(np.float32),
         spread_mm=np.full(81, 0.1, np.float32),
         **dict.fromkeys(("thickness_mm", "error_mm", "room_mm"), unused),
-    )
+    )  # fmt: skip
 
     shifts = choose_shifts(fit, triangles, Fans(triangles, 81)).reshape(9, 9)
 

@@ -58,9 +58,8 @@ def rough_spheres_that_nearly_touch(origin: float) -> Mesh:
     """Two rough spheres 0.4 mm apart, a speck and a vertex without triangles, so many mm from the origin along x."""
     ball, faces = samples.sphere(centre=(0, 0, 0), radius=5.0, rounds=4)
     speck, its_faces = samples.box(low=(0.0, 9.0, 0.0), size=(0.2, 0.2, 0.2))
-    vertices, triangles = samples.join(
-        (rough(ball), faces), (rough(ball, seed=2) + [10.4, 0, 0], faces), (speck, its_faces)
-    )
+    beside = rough(ball, seed=2) + [10.4, 0, 0]
+    vertices, triangles = samples.join((rough(ball), faces), (beside, faces), (speck, its_faces))
     return Mesh(np.concatenate([vertices, [[1.0, 2.0, 3.0]]]) + [origin, 0.0, 0.0], triangles)
 
 
@@ -68,19 +67,16 @@ def rough_spheres_that_nearly_touch(origin: float) -> Mesh:
 def test_a_smoothed_mesh_is_the_same_with_a_device_and_without(device, origin, dtype):
     mesh = rough_spheres_that_nearly_touch(origin)
     assert mesh.vertices.dtype == dtype
-    with_device, without = (
-        clrecon.smooth_mesh(mesh, iterations=20, max_deviation_mm=0.25, device=device),
-        clrecon.smooth_mesh(mesh, iterations=20, max_deviation_mm=0.25),
-    )
+    options = {"iterations": 20, "max_deviation_mm": 0.25}
+    with_device, without = clrecon.smooth_mesh(mesh, **options, device=device), clrecon.smooth_mesh(mesh, **options)
     np.testing.assert_array_equal(with_device.vertices, without.vertices)
     np.testing.assert_array_equal(with_device.normals, without.normals)
     assert with_device.report == without.report
 
 
 def test_smoothing_takes_two_fifths_off_the_roughness(device):
-    report = clrecon.smooth_mesh(
-        rough_spheres_that_nearly_touch(0.0), iterations=20, max_deviation_mm=0.25, device=device
-    ).report
+    mesh = rough_spheres_that_nearly_touch(origin=0.0)
+    report = clrecon.smooth_mesh(mesh, iterations=20, max_deviation_mm=0.25, device=device).report
     roughness = report["refinement"]["smooth"]
     assert roughness["roughness_after_mm"] < 0.6 * roughness["roughness_before_mm"]  # measured 0.29 of it
 
@@ -91,6 +87,5 @@ def test_a_mesh_is_smoothed_by_the_host_where_the_device_has_no_room(device, mon
     expected = clrecon.smooth_mesh(mesh, iterations=5, max_deviation_mm=0.25, device=device)
     monkeypatch.setattr(smoothing.ocl, "describe_shortage", lambda *_: "no room")
     monkeypatch.setattr(smoothing.ocl, "launch", None)
-    np.testing.assert_array_equal(
-        clrecon.smooth_mesh(mesh, iterations=5, max_deviation_mm=0.25, device=device).vertices, expected.vertices
-    )
+    by_host = clrecon.smooth_mesh(mesh, iterations=5, max_deviation_mm=0.25, device=device)
+    np.testing.assert_array_equal(by_host.vertices, expected.vertices)

@@ -101,9 +101,8 @@ def test_trilinear_surfaces_of_random_integers_are_sound(device, high):
 def test_trilinear_surfaces_of_steep_integers_far_from_the_origin_are_sound(device, iso_value):
     """There the vertices inside cells keep a margin from faces and from each other."""
     affine = compose_affine((0.3, 0, 0), (0, 0.3, 0), (0, 0, 0.5), (-900, 900, 1800))
-    assert_sound(
-        extract_trilinear(random_volume((9, 11, 40), dtype="uint16", high=65536, affine=affine), iso_value, device)
-    )
+    volume = random_volume((9, 11, 40), dtype="uint16", high=65536, affine=affine)
+    assert_sound(extract_trilinear(volume, iso_value, device))
 
 
 @pytest.mark.parametrize(("high", "seed", "level"), [(4, 0, 2.0), (3, 1, 1.0)])
@@ -157,9 +156,7 @@ def test_normals_of_a_trilinear_surface_point_to_the_side_that_most_faces_do(dev
     corners = mesh.vertices.astype(np.float64)[mesh.triangles]
     faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     along = np.einsum("ij,ij->i", faces, mesh.normals.astype(np.float64)[mesh.triangles].sum(axis=1))
-    assert (
-        along > 0
-    ).mean() > 0.89  # measured 0.903 of random values: faces are slivers, and gradients turn within a cell
+    assert (along > 0).mean() > 0.89  # measured 0.903: faces of random values are slivers, gradients turn in a cell
     assert np.allclose(np.linalg.norm(mesh.normals, axis=1), 1.0, atol=1e-6)  # float32; measured 2e-7
 
 

@@ -29,9 +29,8 @@ def test_lattice_points_inside_a_box_are_counted_as_by_its_bounds(affine, finer)
     on = block(affine)
     offsets = (0.137, 0.271, 0.389)
     low, side = 2.6, 5.8  # voxels
-    found = measure_slices(
-        placed(samples.box(low=(low,) * 3, size=(side,) * 3), on), on, 50.0, finer=finer, offsets=offsets
-    )
+    box = placed(samples.box(low=(low,) * 3, size=(side,) * 3), on)
+    found = measure_slices(box, on, 50.0, finer=finer, offsets=offsets)
     places = [(np.arange(-99, 99) + offset) / finer for offset in offsets]  # from before the box to behind it
     assert found.points_mesh == np.prod([((low < place) & (place < low + side)).sum() for place in places])
     assert found.rows_odd == 0

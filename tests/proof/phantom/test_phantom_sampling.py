@@ -49,9 +49,7 @@ def test_shares_of_voxels_are_float32_from_0_to_1_with_parts_at_the_surface(
     _, share = sampled_body
     assert share.dtype == np.float32
     assert (share.min(), share.max()) == (0.0, 1.0)
-    assert (
-        (share > 0.0) & (share < 1.0)
-    ).sum() > 1000  # at the surface of bodies of some 10 voxels; measured 1498 to 2734
+    assert ((share > 0.0) & (share < 1.0)).sum() > 1000  # of bodies of some 10 voxels; measured 1498 to 2734
 
 
 def test_body_within_the_grid_has_no_share_of_the_outermost_voxels(sampled_body: tuple[Any, np.ndarray]) -> None:

@@ -77,12 +77,8 @@ def jaw_on_own_scale(request, tmp_path):
     """Slope and offset of a jaw on its own scale, its volume, and the iso value of the same jaw in HU."""
     slope, offset = request.param
     in_hu = choose_iso_value(read_signed(tmp_path / "hu", make_jaw(slope=1, offset=0, padding=None, noise=15.0)))
-    return (
-        slope,
-        offset,
-        read_signed(tmp_path / "own", make_jaw(slope=slope, offset=offset, padding=0.0, noise=15.0)),
-        in_hu,
-    )
+    own = read_signed(tmp_path / "own", make_jaw(slope=slope, offset=offset, padding=0.0, noise=15.0))
+    return slope, offset, own, in_hu
 
 
 def test_iso_value_of_a_scan_on_its_own_scale_is_that_in_hu_on_that_scale(jaw_on_own_scale):
@@ -99,9 +95,8 @@ def test_iso_value_of_a_scan_on_its_own_scale_is_that_in_hu_on_that_scale(jaw_on
 @pytest.mark.parametrize(("slope", "offset"), [(1, 200), (1, 400), (1, 800), (0.6, 400), (1, 324)])
 def test_iso_value_of_a_scan_on_its_own_scale_without_padding_is_that_in_hu_on_that_scale(tmp_path, slope, offset):
     in_hu = choose_iso_value(read_signed(tmp_path / "hu", make_jaw(slope=1, offset=0, padding=None, noise=15.0)))
-    chosen = choose_iso_value(
-        read_signed(tmp_path / "own", make_jaw(slope=slope, offset=offset, padding=None, noise=15.0))
-    )
+    own = read_signed(tmp_path / "own", make_jaw(slope=slope, offset=offset, padding=None, noise=15.0))
+    chosen = choose_iso_value(own)
     expected = slope * in_hu.iso_value + offset
     assert chosen.iso_value == pytest.approx(expected, abs=tolerances.OWN_SCALE_HU * slope)
 

@@ -90,12 +90,8 @@ CAPITALS = pytest.mark.parametrize("vr", [b"AA", b"DA", b"AZ", b"ZZ", b"LO"])
 
 @CAPITALS
 def test_head_with_two_capital_letters_has_them_as_value_representation(vr):
-    assert _Walk(element(0x00100010, vr), items_limit=0).read_head(position=0, end=8, encoding=EXPLICIT) == (
-        0x00100010,
-        vr,
-        0,
-        8,
-    )
+    head = _Walk(element(0x00100010, vr), items_limit=0).read_head(position=0, end=8, encoding=EXPLICIT)
+    assert head == (0x00100010, vr, 0, 8)  # with a length of 0, and its value from byte 8 on
 
 
 @CAPITALS
@@ -142,9 +138,8 @@ def fragments(count: int) -> io.BytesIO:
 def test_frame_of_1999_fragments_is_found():
     """The first item is the table of offsets; a frame in RLE may have several fragments."""
     file = fragments(1 + 1999)
-    frames = transfer_syntaxes.find_frames(
-        file, start=0, file_bytes=len(file.getvalue()), frames=1, transfer_syntax=RLE
-    )
+    size = len(file.getvalue())
+    frames = transfer_syntaxes.find_frames(file, start=0, file_bytes=size, frames=1, transfer_syntax=RLE)
     assert [len(pieces) for pieces in frames] == [1999]
 
 
@@ -245,10 +240,8 @@ def test_unsigned_number_of_another_length_is_refused(raw, vr):
     ("raw", "vr"), [(b"\x30\xf8", "SS"), (b"\x30\xf8", "US"), (b"\x30\xf8\xff\xff", "UL"), (b"\x30\xf8", "OW")]
 )
 def test_padding_value_is_read_as_signed_from_any_binary_form(raw, vr):
-    assert values_of(padding=(0x00280120, raw, vr)).padding(bits_allocated=16, bits_stored=16, signed=True) == (
-        -2000,
-        -2000,
-    )  # lowest and highest
+    values = values_of(padding=(0x00280120, raw, vr))
+    assert values.padding(bits_allocated=16, bits_stored=16, signed=True) == (-2000, -2000)  # lowest and highest
 
 
 @pytest.mark.parametrize(
