@@ -62,8 +62,9 @@ class TriangleTree:
         order = sort_with_rows(codes.astype(np.uint64) << np.uint64(32))[1]
         order = np.concatenate([order, np.full(-len(order) % _LEAF, order[-1])])
         self._rows, self._firsts = order.reshape(-1, _LEAF), codes[order[::_LEAF]]
-        lows = np.array([column[self._rows].min(axis=1) for column in lows])
-        highs = np.array([column[self._rows].max(axis=1) for column in highs])
+        of_leaves = np.ascontiguousarray(self._rows.T)  # numpy takes the least along a short last axis slowly
+        lows = np.array([column.take(of_leaves).min(axis=0) for column in lows])
+        highs = np.array([column.take(of_leaves).max(axis=0) for column in highs])
         self._levels: list[NDArray[np.float32]] = []
         while not self._levels or len(self._levels[0]) > 1:
             empty = ((0, 0), (0, -lows.shape[1] % _FAN))
