@@ -63,8 +63,8 @@ def test_signed_distances_are_positive_outside_in_both_directions(files: dict[st
     there, back = report["a_to_b_signed_mm"], report["b_to_a_signed_mm"]
     assert there["max"] == pytest.approx(2.0, abs=SAMPLED_MM)
     assert there["min"] == pytest.approx(0.0, abs=SAMPLED_MM)
-    assert there["outside_share"] > 0.9  # a encloses b
-    assert back["outside_share"] < 0.1  # and b lies in a
+    assert there["outside_share"] > 0.99  # a encloses b
+    assert back["outside_share"] < 0.01  # and b lies in a
 
 
 def test_words_of_distance_name_the_turned_frame_in_lines_of_60_letters(
@@ -80,7 +80,8 @@ def test_words_of_distance_name_the_turned_frame_in_lines_of_60_letters(
 def test_mesh_file_that_names_no_frame_is_taken_as_lps_and_doubted_where_it_lies_apart(files: dict[str, str]) -> None:
     report = report_distances(files["plain.stl"], files["b.ply"])
 
-    assert report["hausdorff_mm"] > 50.0  # x and y of its middle, 40 and -25 mm, have the other sign
+    # x and y of its middle, 40 and -25 mm, have the other sign.
+    assert report["hausdorff_mm"] == pytest.approx(2 * np.hypot(40.0, 25.0), abs=SAMPLED_MM)
     assert any("taken as LPS" in text for text in report["warnings"])
     assert any("apart: is the frame of the file that names none another?" in text for text in report["warnings"])
 
@@ -109,7 +110,7 @@ def test_mesh_is_half_a_mm_outside_of_the_surface_fitted_to_the_bone_of_a_scan(
 
     assert (report["b"]["kind"], report["b"]["iso_value_hu"]) == ("scan", 200.0)
     assert report["b"]["cortex"]["moved"] > 0
-    assert report["a_to_b_signed_mm"]["mean"] == pytest.approx(13.5 - 13.0, abs=0.08)  # of voxels of 1 mm
+    assert report["a_to_b_signed_mm"]["mean"] == pytest.approx(13.5 - 13.0, abs=0.02)  # measured 0.501
 
 
 def test_mesh_is_nearer_to_the_iso_surface_of_a_scan_than_to_its_bone(
@@ -118,7 +119,8 @@ def test_mesh_is_nearer_to_the_iso_surface_of_a_scan_than_to_its_bone(
     report = report_distances(*ball_and_scan, "--surface", "hu", "--device", str(device.index))
 
     assert (report["b"]["kind"], report["b"]["iso_value_hu"], report["b"]["cortex"]) == ("scan", 200.0, None)
-    assert report["a_to_b_signed_mm"]["mean"] < 0.1  # 200 HU lies 0.7 mm outside of bone blurred by 0.7 mm
+    # 200 HU lies further outside: measured -0.28, of 0.5 from the bone.
+    assert -0.4 < report["a_to_b_signed_mm"]["mean"] < -0.2
 
 
 @pytest.mark.usefixtures("device")
@@ -198,7 +200,7 @@ def test_written_mesh_is_red_beyond_the_range_and_light_where_there_is_no_distan
     far, near = distances > 1.0, np.abs(distances) < 0.02
     assert far.any() and near.any()
     assert (report["colors"]["signed"], report["colors"]["range_mm"]) == (True, 1.0)
-    assert 0.05 < report["colors"]["beyond_share"] < 0.9  # of the area: the ends
+    assert 0.4 < report["colors"]["beyond_share"] < 0.6  # of the area, the ends: measured 0.48
     colors = np.asarray(trimesh.load(out, process=False).visual.vertex_colors)[:, :3].astype(int)
     dark_red, light_grey = (178, 24, 43), 222  # the end of the scale, and its middle
     assert (colors[far] == dark_red).all()

@@ -63,7 +63,7 @@ def test_largest_component_that_is_a_heart_is_warned_of(level: Any, set_scan: An
 
     report = mesh_scan(tmp_path, device, keep_largest=1, **level)
 
-    assert report["volume_ml"] == pytest.approx(HEART_ML, rel=0.15)  # 200 HU lies near half way from 40 to 380 HU
+    assert report["volume_ml"] == pytest.approx(HEART_ML, rel=0.03)  # 200 HU lies near half way from 40 to 380 HU
     assert report["walls"]["looks_like"] == "contrast medium"
     (warning,) = warnings_with("what is kept looks like contrast medium", report)
     assert "reach 600 at 0.0 %; keep='bone'" in warning  # compact bone has 600 HU, the heart 380
@@ -158,7 +158,7 @@ def test_print_of_values_that_are_not_hu_keeps_the_largest_piece_with_a_warning(
     report = mesh_scan(tmp_path, device, **settings_for("print", {"iso_value": near_half_way_to_the_heart}))
 
     assert report["closed"]
-    assert report["volume_ml"] == pytest.approx(HEART_ML, rel=0.1)  # voxels of 1 x 1 x 1.5 mm
+    assert report["volume_ml"] == pytest.approx(HEART_ML, rel=0.08)  # measured 4 % less
     (warning,) = warnings_with("nothing was left out for that", report)
     assert "not known to be HU" in warning
     assert "rescale=" in warning
@@ -197,7 +197,7 @@ def test_component_about_the_spinal_canal_is_kept_as_bone_where_no_wall_is_dense
 
     report = mesh_scan(tmp_path, device, iso_value=200.0, keep="bone")
 
-    assert report["volume_ml"] == pytest.approx(BONE_ML, rel=0.2)  # the heart has 2.4 times as much
+    assert report["volume_ml"] == pytest.approx(BONE_ML, rel=0.2)  # measured 11 % less; the heart has 2.4 times as much
     assert len(warnings_with("the one round the spinal canal was kept", report)) == 1
 
 
