@@ -11,17 +11,9 @@ from pathlib import Path
 import pytest
 from volume_files import make_ct, write_metaimage
 
-from clrecon.proof.phantom import PhantomSettings, write_phantom
 from clrecon.system.foreign_words import hush, own_streams
 
 CLRECON = [sys.executable, "-m", "clrecon"]
-
-
-@pytest.fixture(scope="module")
-def sphere(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("words") / "ct"
-    write_phantom(folder, PhantomSettings(kind="sphere", size=(24, 24), slices=16))
-    return folder
 
 
 @pytest.mark.parametrize(
