@@ -159,6 +159,8 @@ class CortexConstants(Record):
     noise_hu: Standard deviation of the HU in soft tissue; None where there is none to measure it in.
     residual_hu: Root mean square of what the fit leaves of these profiles.
     places, thick: Profiles that were used, and those among them of walls that are thick enough to show their HU.
+    denser: The two widths and the HU at the dense end of those that describe the profiles as well, where all walls are
+        thin and alike: there only the three together are known.
     """
 
     blur_mm: float
@@ -171,11 +173,18 @@ class CortexConstants(Record):
     residual_hu: float
     places: int
     thick: int
+    denser: list[float] | None = None
 
     @property
     def cortex_spread(self) -> float:
         """Share by which the cortex of a place may differ."""
         return max(CORTEX_SPREAD, self.cortex_error_hu / self.cortex_hu)
+
+    def at_dense_end(self) -> CortexConstants:
+        """Return the constants with those of `denser`, which must be there, in place of its own."""
+        assert self.denser is not None
+        blur_mm, across_mm, cortex_hu = self.denser
+        return self.changed(blur_mm=blur_mm, blur_across_mm=across_mm, cortex_hu=cortex_hu)
 
     @property
     def known_noise(self) -> float:
@@ -307,6 +316,8 @@ class ProfileSampler:
         self, points: NDArray[np.floating], normals: NDArray[np.floating]
     ) -> Iterator[tuple[NDArray[np.intp], Any]]:
         """Yield the rows of each piece, and its values on the device, (ROWS, stride)."""
+        if not len(points):
+            return
         resident, nk = self._resident, self._resident.volume.shape_ijk[2]
         places, directions = self.frame.places(points), self.frame.directions(normals)
         least_gap = float(self.frame.gaps.min()) if nk > 1 else 1.0

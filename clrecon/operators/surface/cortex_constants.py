@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -67,6 +66,29 @@ _FEWEST_THICK = 12
 the fit leaves the cortex free within the third; of these the percentile, since walls differ and blur only ever lowers
 them."""
 
+_ALIKE_THICK = 1.55
+_SOLID_BLURS, _AS_DENSE = 4.0, 0.95
+_MOST_RIMS = 0.1
+"""Walls whose 85th percentile of thickness is less than the first times the 15th are alike: of thin ones profiles do
+not tell a denser wall from a thicker one.  Shells and plates of 0.5 to 2 mm have 1.1 to 1.5, bodies 1.7 to 5.  What was
+measured in them is the least that describes them.  Walls of more than the second in blurs do not count, which are rims,
+with 0.7 to 0.9 of these HU; if they show the third of these or more, or are more than the fourth share of all, they are
+solid, and the cortex is known."""
+
+_AS_WELL = 1.1
+_DENSER_STEP, _MOST_DENSER = 1.1, 2.2
+_DENSER_SHARE = 1.0 / 3.0
+"""The cortex of such walls lies anywhere from there to the HU that leave the first times as much of the profiles, tried
+in steps of the second up to the third; the fourth share of the way is taken (of 13 shells and plates that of 12 lay at
+a quarter to all of it, of one at its beginning)."""
+
+_ACROSS_UNSEEN, _ONE_DIRECTION = 0.13, 0.08
+_UNSEEN_ERROR = 0.5
+"""Walls whose normals' part across slices has squares with an upper quartile below the first do not show the blur
+across, nor those within slices the one within; where the quartiles are nearer to each other than the second (plates
+0.04 to 0.07, bodies 0.2 to 0.6) they show one blur of both.  What they do not show is that of the voxels, or keeps the
+ratio of these, and is known within the third share."""
+
 _LEAST_BLUR_ERROR = 0.02
 _LEAST_CORTEX_ERROR = 0.05
 _THIN_CORTEX_ERROR = 0.3
@@ -81,14 +103,39 @@ class _Trial(NamedTuple):
     across_mm: float
     cortex_hu: float
 
-    def changed(self, axis: int, factor: float) -> _Trial:
+    def changed(self, axes: tuple[int, ...], factor: float) -> _Trial:
         blurs = [self.blur_mm, self.across_mm]
-        blurs[axis] *= factor
+        for axis in axes:
+            blurs[axis] *= factor
         return _Trial(blurs[0], blurs[1], self.cortex_hu)
 
 
-_Fit = Callable[[_Trial, float], WallFits]
-"""Fits all walls with the constants of a trial and a spread of the cortex."""
+class _Walls:
+    """Profiles across walls, which are fitted with the constants of a trial and a spread of the cortex.
+
+    values: ndarray, shape (ROWS, n).
+    axes: Of the blurs within and across slices those that are searched, and those that change together.
+    """
+
+    def __init__(self, sampler: ProfileSampler, values: Float32Array, noise: float | None):
+        profiles, known = sampler.take(values), SILENT_HU if noise is None else noise
+        self.values, self.noise = values, noise
+
+        def fit_trial(trial: _Trial, spread: float) -> WallFits:
+            return profiles.fit(trial.blur_mm, trial.across_mm, trial.cortex_hu, known, cortex_spread=spread)
+
+        self.fit = functools.cache(fit_trial)
+        low, high = np.percentile(values[SAMPLES], (25.0, 75.0))
+        self.axes: tuple[tuple[int, ...], ...] = ((0,), (1,))
+        if high < _ACROSS_UNSEEN or low > 1.0 - _ACROSS_UNSEEN:
+            self.axes = ((0,),) if high < _ACROSS_UNSEEN else ((1,),)
+        elif high - low < _ONE_DIRECTION:
+            self.axes = ((0, 1),)
+
+    @property
+    def unseen(self) -> list[bool]:
+        """Which of the two blurs the walls do not show by itself."""
+        return [(axis,) not in self.axes for axis in (0, 1)]
 
 
 def measure_constants(
@@ -104,30 +151,58 @@ def measure_constants(
         noise = measure_noise(volume).hu
     except UsageError:  # a specimen in air
         noise = None
-    fit = _fit_with(sampler, values, noise)
-    return _measure_errors(fit, values, *_search(fit, values, volume), noise)
+    walls = _Walls(sampler, values, noise)
+    trial, thick = _search(walls, volume)
+    return _measure_errors(walls, trial, thick, _find_denser(walls, trial))
 
 
-def _fit_with(sampler: ProfileSampler, values: Float32Array, noise: float | None) -> _Fit:
-    profiles, known = sampler.take(values), SILENT_HU if noise is None else noise
-
-    @functools.cache
-    def fit_trial(trial: _Trial, spread: float) -> WallFits:
-        return profiles.fit(trial.blur_mm, trial.across_mm, trial.cortex_hu, known, cortex_spread=spread)
-
-    return fit_trial
-
-
-def _measure_errors(fit: _Fit, values: Float32Array, trial: _Trial, thick: int, noise: float | None) -> CortexConstants:
-    """Return the constants of a trial with their uncertainties."""
+def _measure_errors(
+    walls: _Walls, trial: _Trial, thick: int, together: tuple[_Trial, _Trial] | None = None
+) -> CortexConstants:
+    """Return the constants of a trial with their uncertainties, or those of the first of two that fit as well."""
     parts = []
     for part in [slice(first, None, 4) for first in range(4)]:
-        blurs = _search_blurs(fit, part, trial, SEARCH_STEPS[1:])[:2]
-        parts.append((*blurs, _measure_cortex(fit, values, part, trial)[0]))
-    least = np.array([_LEAST_BLUR_ERROR] * 2 + [_LEAST_CORTEX_ERROR if thick >= _FEWEST_THICK else _THIN_CORTEX_ERROR])
+        blurs = _search_blurs(walls, part, trial, SEARCH_STEPS[1:])[:2]
+        parts.append((*blurs, _measure_cortex(walls, part, trial)[0]))
+    if together is not None:
+        trial, denser = together
+    blur_errors = [_UNSEEN_ERROR if is_unseen else _LEAST_BLUR_ERROR for is_unseen in walls.unseen]
+    least = np.array([*blur_errors, _LEAST_CORTEX_ERROR if thick >= _FEWEST_THICK else _THIN_CORTEX_ERROR])
     errors = np.maximum(np.std(parts, axis=0) / 2.0, least * np.mean(parts, axis=0)).tolist()
-    residual = float(np.sqrt(np.mean(np.square(fit(trial, CORTEX_SPREAD).residual_hu))))
-    return CortexConstants(*trial, errors[0], errors[1], errors[2], noise, residual, values.shape[1], thick)
+    if together is not None:
+        errors = [max(error, abs(end - own)) for error, end, own in zip(errors, denser, trial, strict=True)]
+    residual = float(np.sqrt(np.mean(np.square(walls.fit(trial, CORTEX_SPREAD).residual_hu))))
+    places = walls.values.shape[1]
+    known = CortexConstants(*trial, errors[0], errors[1], errors[2], walls.noise, residual, places, thick)
+    return known if together is None else known.changed(denser=list(denser))
+
+
+def _find_denser(walls: _Walls, trial: _Trial) -> tuple[_Trial, _Trial] | None:
+    """Return what is taken of the constants that describe alike walls as well, and their dense end; None for one."""
+    blurs = blurs_of(walls.values[SAMPLES:], trial.blur_mm, trial.across_mm)
+    fits = walls.fit(trial, _WIDE_SPREAD)
+    ratios = fits.thickness_mm / blurs
+    is_solid = ratios > _SOLID_BLURS
+    solid = fits.cortex_hu[is_solid]
+    shows_solid = len(solid) >= _FEWEST_THICK and np.percentile(solid, _DENSE_PERCENTILE) > _AS_DENSE * trial.cortex_hu
+    if shows_solid or len(solid) > _MOST_RIMS * len(ratios):
+        return None
+    thin, thick = np.percentile(ratios[~is_solid], (15.0, 85.0))
+    if thick >= _ALIKE_THICK * thin:
+        return None
+    end, least = trial, _left(walls, slice(None), trial)
+    most = min(_MOST_DENSER * trial.cortex_hu, METAL_HU)
+    while end.cortex_hu * _DENSER_STEP <= most:
+        candidate = end._replace(cortex_hu=end.cortex_hu * _DENSER_STEP)
+        candidate = _search_blurs(walls, slice(None), candidate, SEARCH_STEPS[1:])
+        left = _left(walls, slice(None), candidate)
+        if left > _AS_WELL * least:
+            break
+        end, least = candidate, min(left, least)
+    if end is trial:
+        return None
+    nearer = trial._replace(cortex_hu=trial.cortex_hu * (end.cortex_hu / trial.cortex_hu) ** _DENSER_SHARE)
+    return _search_blurs(walls, slice(None), nearer, SEARCH_STEPS[1:]), end
 
 
 def find_groups(
@@ -153,11 +228,13 @@ def find_groups(
             continue
         if not _may_differ(sampler, values, scan):
             continue
-        fit = _fit_with(sampler, values, scan.noise_hu)
-        trial, thick = _search(fit, values, volume)
+        walls = _Walls(sampler, values, scan.noise_hu)
+        trial, thick = _search(walls, volume)
         is_bone = thick >= _FEWEST_THICK and trial.cortex_hu >= COMPACT_HU
         if is_bone and abs(trial.cortex_hu - scan.cortex_hu) > _DIFFERENT * scan.cortex_hu:
-            groups.append((rows, _measure_errors(fit, values, trial, thick, scan.noise_hu)))
+            if scan.denser is not None and _find_denser(walls, trial) is not None:
+                continue
+            groups.append((rows, _measure_errors(walls, trial, thick)))
             left[rows] = False
     return [(np.flatnonzero(left), scan), *groups]
 
@@ -191,59 +268,59 @@ def _may_differ(sampler: ProfileSampler, values: Float32Array, scan: CortexConst
     if np.count_nonzero(values[: CENTRE + 2].max(axis=0) >= COMPACT_HU) < _FEWEST_THICK:
         return False
     trial = _Trial(scan.blur_mm, scan.blur_across_mm, scan.cortex_hu)
-    fits = sampler.take(values).fit(*trial, scan.known_noise, cortex_spread=_WIDE_SPREAD)
-    shown, thick = _measure_cortex(lambda *_: fits, values, slice(None), trial)
+    shown, thick = _measure_cortex(_Walls(sampler, values, scan.noise_hu), slice(None), trial)
     return thick < _FEWEST_THICK or abs(shown - scan.cortex_hu) > _ALIKE * scan.cortex_hu
 
 
-def _search(fit: _Fit, values: Float32Array, volume: Volume) -> tuple[_Trial, int]:
+def _search(walls: _Walls, volume: Volume) -> tuple[_Trial, int]:
     """Return the constants that describe the profiles, and how many walls are thick enough to show their HU."""
+    values = walls.values
     dense, usual = np.percentile(values[: CENTRE + 2].max(axis=0), (95.0, _DENSE_PERCENTILE)).tolist()
     x_mm, y_mm, z_mm = volume.spacing
     within, across = (min(0.7 * edge**0.5, edge) for edge in (math.sqrt(x_mm * y_mm), z_mm))
     start = _Trial(within, max(across, 0.45 * z_mm), min(1.03 * dense, 1.2 * usual))
-    best = _search_blurs(fit, slice(None), start, SEARCH_STEPS)
-    cortex_hu, thick = _measure_cortex(fit, values, slice(None), best)
+    best = _search_blurs(walls, slice(None), start, SEARCH_STEPS)
+    cortex_hu, thick = _measure_cortex(walls, slice(None), best)
     shown = thick >= _THICK_SHARE * values.shape[1]
     for first in range(1, len(SEARCH_STEPS)):
-        candidate = _search_blurs(fit, slice(None), best._replace(cortex_hu=cortex_hu), SEARCH_STEPS[first:])
-        if shown and _left(fit, slice(None), candidate) >= _left(fit, slice(None), best):
+        candidate = _search_blurs(walls, slice(None), best._replace(cortex_hu=cortex_hu), SEARCH_STEPS[first:])
+        if shown and _left(walls, slice(None), candidate) >= _left(walls, slice(None), best):
             break
         best = candidate
-        cortex_hu, thick = _measure_cortex(fit, values, slice(None), best)
+        cortex_hu, thick = _measure_cortex(walls, slice(None), best)
     if not shown:
         return best._replace(cortex_hu=cortex_hu), thick
     while True:
         candidate = best._replace(cortex_hu=best.cortex_hu / _CORTEX_STEP)
-        candidate = _search_blurs(fit, slice(None), candidate, SEARCH_STEPS[2:])
-        if _left(fit, slice(None), candidate) >= _CLEARLY_LESS * _left(fit, slice(None), best):
+        candidate = _search_blurs(walls, slice(None), candidate, SEARCH_STEPS[2:])
+        if _left(walls, slice(None), candidate) >= _CLEARLY_LESS * _left(walls, slice(None), best):
             return best, thick
         best = candidate
 
 
-def _left(fit: _Fit, part: slice, trial: _Trial) -> float:
+def _left(walls: _Walls, part: slice, trial: _Trial) -> float:
     """Return the mean square of what a trial leaves of a part of the profiles."""
-    squares = np.sort(np.square(fit(trial, _NARROW_SPREAD).residual_hu[part], dtype=np.float64))
+    squares = np.sort(np.square(walls.fit(trial, _NARROW_SPREAD).residual_hu[part], dtype=np.float64))
     return float(np.mean(squares[: max(1, int(_TRIMMED * len(squares)))]))
 
 
-def _search_blurs(fit: _Fit, part: slice, best: _Trial, factors: tuple[float, ...]) -> _Trial:
+def _search_blurs(walls: _Walls, part: slice, best: _Trial, factors: tuple[float, ...]) -> _Trial:
     """Return the blurs that leave least of a part of the profiles, from those of a trial on."""
-    first, least = best, _left(fit, part, best)
+    first, least = best, _left(walls, part, best)
     for factor in factors:
-        for axis in (0, 1):
+        for axes in walls.axes:
             for change in (factor, 1.0 / factor):
-                while (value := _left(fit, part, trial := best.changed(axis, change))) < 0.9999 * least:
+                while (value := _left(walls, part, trial := best.changed(axes, change))) < 0.9999 * least:
                     best, least = trial, value
                     if not all(1.0 / FARTHEST < new / old < FARTHEST for new, old in zip(trial, first, strict=True)):
                         return best
     return best
 
 
-def _measure_cortex(fit: _Fit, values: Float32Array, part: slice, trial: _Trial) -> tuple[float, int]:
+def _measure_cortex(walls: _Walls, part: slice, trial: _Trial) -> tuple[float, int]:
     """Return the HU of compact bone in a part of the profiles, and how many walls are thick enough to show it."""
-    fits = fit(trial, _WIDE_SPREAD)
-    blurs = blurs_of(values[SAMPLES:, part], trial.blur_mm, trial.across_mm)
+    fits = walls.fit(trial, _WIDE_SPREAD)
+    blurs = blurs_of(walls.values[SAMPLES:, part], trial.blur_mm, trial.across_mm)
     thick = (fits.thickness_mm[part] > _THICK_BLURS * blurs) & (blurs < _SHARP * trial.blur_mm)
     if np.count_nonzero(thick) < _FEWEST_THICK:
         return trial.cortex_hu, int(np.count_nonzero(thick))

@@ -89,6 +89,11 @@ _COARSE_ERROR = 0.033
 are blurred more between voxels than at them, which the model does not know."""
 
 
+_DENSER_ERROR = np.float32(0.5)
+"""Standard error of what lies anywhere from half as far on the other side up to 1: from the least cortex to the densest
+where a third of the way is taken."""
+
+
 @dataclass(frozen=True)
 class CortexFit:
     """Where the outer surface of bone lies across the vertices of a mesh, shape (n,) each.
@@ -154,6 +159,7 @@ def fit_walls(
             with stopwatch.running(resident.device):
                 profiles = WallProfiles(sampler, values_d, len(rows))
                 walls, frames = profiles.fit_with(known), profiles.frames()
+                denser = None if known.denser is None else profiles.fit_with(known.at_dense_end()).shift_mm
             within, across = known.blur_mm**2, known.blur_across_mm**2
             blurs = np.sqrt(within + (across - within) * steep[rows])
             hidden = (blurs > _ACROSS * known.blur_mm) & (walls.thickness_mm < _HIDDEN_BLURS * blurs)
@@ -167,6 +173,8 @@ def fit_walls(
             steps = sampler.frame.steps_along(normals[rows], frames[1])
             ratios = steps / blurs_of(frames, known.blur_mm, known.blur_across_mm)
             fit.error_mm[rows] = standard_errors(walls, known, coarse_mm=steps * ratios * ratios)
+            if denser is not None:
+                fit.error_mm[rows] = np.hypot(fit.error_mm[rows], _DENSER_ERROR * (denser - walls.shift_mm))
     return fit
 
 
@@ -553,6 +561,9 @@ def _measure_bias(
     rows = fitted[spread_rows(len(fitted), _BIAS_ROWS)]
     sampler = ProfileSampler(resident, Stopwatch())
     walls, known = sampler.take(sampler.values(points[rows], normals[rows])), fit.constants
+    if known.denser is not None:
+        apart = walls.fit_with(known.at_dense_end()).shift_mm.astype(np.float64) - walls.fit_with(known).shift_mm
+        return abs(float(_DENSER_ERROR * apart.mean()))
     changes = []
     for name in ("blur_mm", "blur_across_mm", "cortex_hu"):
         error = getattr(known, f"{name.removesuffix('_mm').removesuffix('_hu')}_error_{name[-2:]}")

@@ -304,12 +304,35 @@ def test_slices_that_blur_no_more_than_their_pixels_hide_no_wall(device):
     assert not fit.hidden.any()
 
 
-def test_thin_walls_alone_are_taken_for_thicker_and_less_dense_ones(device):
-    """Walls of 0.8 mm and 1000 HU in a blur of 0.7 mm."""
-    mesh, fit = fit_surface(hollow_ball(thickness=0.8), device)
-    assert fit.constants.cortex_hu < 800.0  # measured 566
-    away, _ = outer_places(mesh, fit)
-    assert 0.1 < np.mean(away) < 0.35  # mm outside of the bone; measured 0.31
+@pytest.mark.parametrize("thickness", [0.8, 1.0, 1.5])
+def test_errors_of_thin_walls_alone_hold_95_percent_of_the_distances_from_the_truth(device, thickness):
+    """Walls of up to twice the blur of 0.7 mm; 1000 HU lie in the range of what describes them as well."""
+    mesh, fit = fit_surface(hollow_ball(thickness=thickness), device)
+    away, rows = outer_places(mesh, fit)
+    assert np.mean(np.abs(away) < 1.96 * fit.error_mm[rows]) > 0.95
+    assert fit.constants.denser[2] > 1000.0
+
+
+def test_thick_walls_have_no_denser_constants(device):
+    assert fit_surface(hollow_ball(thickness=3.0), device)[1].constants.denser is None
+
+
+def plate(thickness: float) -> Volume:
+    """A plate of 24 x 24 mm and 1000 HU, tilted by 30 degrees against the slices, blurred by 0.6 of its 1 mm voxels."""
+    k, j, i = (index - 17.0 for index in np.indices((35, 35, 35)))
+    along, across = 0.866 * j - 0.5 * k, 0.5 * j + 0.866 * k
+    inside = np.ones(i.shape)
+    for place, half in ((i, 12.0), (along, 12.0), (across, thickness / 2.0)):
+        inside *= ndtr((place + half) / 0.6) - ndtr((place - half) / 0.6)
+    noise = np.random.default_rng(2).normal(0.0, 10.0, i.shape)
+    return Volume(np.rint(50.0 + 950.0 * inside + noise).astype(np.int16), np.eye(4))
+
+
+def test_walls_of_one_direction_have_one_blur_and_leave_the_other_unknown(device):
+    """Searched for both, the blur within slices became 0.04 mm, with an error of 0.001 mm."""
+    constants = fit_surface(plate(2.0), device)[1].constants
+    assert constants.blur_mm == constants.blur_across_mm == pytest.approx(0.6, abs=0.15)
+    assert constants.blur_error_mm >= 0.4 * constants.blur_mm
 
 
 def test_sheets_of_a_couch_around_a_shell_leave_the_constants_of_its_bone(device):
