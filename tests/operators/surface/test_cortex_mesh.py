@@ -25,9 +25,11 @@ from clrecon.operators.surface import cortex, decimation
 from clrecon.operators.surface.cortex_mesh import (
     _BADLY_FITTED,
     FITTED,
+    NOT_BONE,
     CortexFit,
     calm_vertices,
     choose_shifts,
+    doubt_lone_vertices,
     find_turned,
     fit_walls,
 )
@@ -128,11 +130,33 @@ def test_vertices_that_stay_are_left_as_they_are(level_mesh):
     assert np.array_equal(same, level_mesh.vertices)
 
 
+def sheet_of_triangles() -> np.ndarray:
+    """Two triangles for each square of 9 x 9 vertices."""
+    corner = np.arange(81).reshape(9, 9)[:8, :8].ravel()
+    return np.concatenate([corner[:, None] + [0, 1, 10], corner[:, None] + [0, 10, 9]]).astype(np.uint32)
+
+
+def test_vertex_without_bone_follows_its_wall_only_where_most_around_it_are_fitted():
+    """Of a sheet of 9 x 9 vertices the last three columns are no bone, and one vertex within the others."""
+    states = np.full((9, 9), FITTED, np.uint8)
+    states[:, 6:] = states[4, 2] = NOT_BONE
+    unused = np.full(81, -0.5, np.float32)
+    names = ("thickness_mm", "error_mm", "room_mm", "shift_mm")
+    fit = CortexFit(None, (), states.ravel(), np.zeros(81, bool), spread_mm=-unused, **dict.fromkeys(names, unused))
+    triangles, fans = sheet_of_triangles(), Fans(sheet_of_triangles(), 81)
+
+    doubt_lone_vertices(fit, triangles, fans)
+
+    within = slice(1, 8)  # whose neighbours are all there
+    assert np.argwhere(fit.states.reshape(9, 9)[within] == _BADLY_FITTED).tolist() == [[3, 2]]
+    shifts = choose_shifts(fit, triangles, fans).reshape(9, 9)[within]
+    np.testing.assert_allclose(shifts, np.where(np.arange(9) < 6, -0.5, 0.0) + np.zeros((7, 1)), rtol=1e-6)  # float32
+
+
 def test_hidden_walls_follow_their_fitted_neighbours_three_vertices_far_and_others_one():
     """A sheet of 9 x 9 vertices, the first three columns fitted by -0.5 mm; the others of the first 5 rows hidden."""
     rows, columns = np.indices((9, 9))
-    corner = (9 * rows + columns)[:8, :8].ravel()
-    triangles = np.concatenate([corner[:, None] + [0, 1, 10], corner[:, None] + [0, 10, 9]]).astype(np.uint32)
+    triangles = sheet_of_triangles()
     is_fitted = (columns < 3).ravel()
     unused = np.full(81, np.nan, np.float32)
     fit = CortexFit(
