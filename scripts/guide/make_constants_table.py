@@ -66,9 +66,9 @@ SHOWN_BY = {
     "anatomy/body.py": "anatomy/test_body_bone.py::test_a_block_of_micro_ct_with_large_cells_stays_whole",
     "anatomy/body_cells.py": "anatomy/test_body_cells.py::test_counts_of_cells_hold_every_voxel_of_micro_ct",
     "anatomy/iso_choice.py": "anatomy/test_iso_choice.py"
-    "::test_iso_value_of_any_scale_lies_half_way_between_two_materials",
+    "::test_iso_value_on_the_scale_of_the_scan_itself_lies_half_way_between_its_materials",
     "anatomy/materials.py": "anatomy/test_iso_choice.py"
-    "::test_iso_value_of_any_scale_lies_half_way_between_two_materials",
+    "::test_iso_value_on_the_scale_of_the_scan_itself_lies_half_way_between_its_materials",
     "labels/structures.py": (
         "labels/test_structure_sets.py::test_contour_within_a_tenth_of_the_step_of_its_slice_is_read_with_a_warning"
     ),

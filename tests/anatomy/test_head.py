@@ -180,14 +180,14 @@ SQUARE_CM2 = 4.0 * 4.0
 UPWARDS = np.array([[0, 1, 2], [0, 2, 3]])
 
 
-def add_case(tissue: np.ndarray, passage_mm: float = 0.0) -> Volume:
-    """A closed case of tissue, three voxels thick, around the plate, with a square passage through its lid."""
+def add_case(tissue: np.ndarray, passage_voxels: int) -> Volume:
+    """A case of tissue, three voxels thick, around the plate, with a square passage through its lid; odd, or 0."""
 
     def cube(half: int) -> np.ndarray:
         return (abs(SLICE - 20) < half) & (abs(ROW - 20) < half) & (abs(COLUMN - 20) < half)
 
     with_case = np.where(cube(18) & ~cube(15), 40, tissue)
-    passage = (SLICE >= 34) & (abs(ROW - 20) < passage_mm / 4) & (abs(COLUMN - 20) < passage_mm / 4)
+    passage = (SLICE >= 34) & (abs(ROW - 20) < passage_voxels / 2) & (abs(COLUMN - 20) < passage_voxels / 2)
     return Volume(np.where(passage, -1000, with_case).astype(np.int16), np.diag([2.0, 2.0, 2.0, 1.0]))
 
 
@@ -202,12 +202,12 @@ def test_a_surface_that_faces_the_air_around_is_skin(triangles: np.ndarray, area
 
 @pytest.mark.fault_row(70)
 @pytest.mark.parametrize(
-    ("passage_mm", "area_cm2"), [(0.0, 0.0), (8.0, 0.0), (24.0, SQUARE_CM2)], ids=["closed", "narrow", "wide"]
+    ("passage_voxels", "area_cm2"), [(0, 0.0), (7, 0.0), (9, SQUARE_CM2)], ids=["closed", "14 mm", "18 mm"]
 )
 def test_a_surface_inside_of_a_case_is_skin_only_behind_a_passage_wider_than_16_mm(
-    passage_mm: float, area_cm2: float
+    passage_voxels: int, area_cm2: float
 ) -> None:
-    area = measure_skin(add_case(PLATE, passage_mm=passage_mm), SQUARE, UPWARDS)
+    area = measure_skin(add_case(PLATE, passage_voxels), SQUARE, UPWARDS)
     assert area == pytest.approx(area_cm2)
 
 

@@ -26,7 +26,7 @@ SETTINGS = PhantomSettings(size=(160, 144), slices=60, spacing=(1.9, 1.8, 2.5))
 def phantom():
     """A volume and its canal, 1,500 points from T9 to L3."""
     voxels, affine, truth = make_phantom(SETTINGS)
-    field = tuple(float(n) for n in np.multiply(voxels.shape[::-1], (1.9, 1.8, 2.5)))
+    field = tuple(float(n) for n in np.multiply(voxels.shape[::-1], affine.diagonal()[:3]))
     planned = plan_anatomy(field, affine[:3, :3], SETTINGS.seed).vertebrae
     centres = np.array([level["center_lps_mm"] for level in truth["spine"]["vertebrae"]])
     shift = centres - [level.center for level in planned]
@@ -128,11 +128,12 @@ def test_the_canal_is_found_in_sagittal_slices(phantom):
 
 
 def test_a_canal_with_more_of_the_body_behind_it_than_in_front_is_found(phantom):
-    """As in a neck: 57 mm in front of the middle of the canal, and soft tissue as far back as the scan goes."""
+    """As in a neck: 57 mm in front of the middle of the canal, and soft tissue up to 15 mm from the scan's last row."""
     volume, canal = phantom
     row = round(float(volume.lps_to_ijk([canal.mean(axis=0)])[0, 1]))
     voxels = np.array(volume.voxels)
-    voxels[:, : row - 30] = -1000  # rows are 1.9 mm apart
+    assert volume.spacing[1] == pytest.approx(1.9)  # mm from row to row: 30 are 57 mm, 8 are 15 mm
+    voxels[:, : row - 30] = -1000
     voxels[:, row:-8][voxels[:, row:-8] < -200] = 40
     check_lies_in_canal(find_spine_line(Volume(voxels, volume.affine)), canal)
 

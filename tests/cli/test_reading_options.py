@@ -9,11 +9,12 @@ from dicom_series import Plan, write_series
 from clrecon.cli.main import main
 
 SHAPE = (8, 10, 11)
+AIR_HU, BLOCK_HU, SECOND_PHASE_HU = -1000, 476, 276
 
 
-def set_block(ds, k, hu=476):
+def set_block(ds, k, hu=BLOCK_HU):
     """A block of bone in the middle of air, from slice 2 to slice 5."""
-    air = 24  # stored: HU and 1024
+    air = AIR_HU + 1024  # as stored
     pixels = np.full(SHAPE[1:], air, "i2")
     pixels[3:7, 3:8] = hu + 1024 if 2 <= k <= 5 else air
     ds.PixelData = pixels.tobytes()
@@ -42,15 +43,15 @@ def test_mesh_over_an_allowed_gap_is_as_tall_as_the_bone_with_a_warning(ct_with_
     assert (report["volume"]["slices_missing"], report["volume"]["uneven"]) == (1, True)
     assert any("1 slice missing between" in text for text in report["warnings"])
     # Three gaps from slice 2 to slice 5; beyond its ends the level lies a part of a gap out, towards air.
-    part = (476 - report["iso_level_hu"]) / (476 + 1000)
+    part = (BLOCK_HU - report["iso_level_hu"]) / (BLOCK_HU - AIR_HU)
     low, high = np.array(report["bounds_mm"])[:, 2]
     assert high - low == pytest.approx((3 + 2 * part) * 1.25, abs=1e-3)  # float32 of 400 mm
 
 
 @pytest.fixture
 def ct_of_two_phases(tmp_path):
-    """Two phases of the block: 476 HU in the first, 276 HU in the second."""
-    for number, hu in ((1, 476), (2, 276)):
+    """Two phases of the block, of different HU."""
+    for number, hu in ((1, BLOCK_HU), (2, SECOND_PHASE_HU)):
 
         def change(ds, k, number=number, hu=hu):
             set_block(ds, k, hu)
@@ -75,4 +76,4 @@ def test_chosen_phase_of_a_series_is_read(ct_of_two_phases, tmp_path, printed):
 
     volume = printed().report()["volume"]
     assert volume["phase"]["number"] == 2
-    assert volume["hu_range"] == [-1000, 276]
+    assert volume["hu_range"] == [AIR_HU, SECOND_PHASE_HU]

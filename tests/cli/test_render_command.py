@@ -308,7 +308,7 @@ def test_slab_of_a_slice_is_combined_by_mean_maximum_or_minimum(
 
 @pytest.mark.parametrize("kind", ["straightened", "stretched"])
 def test_curve_of_a_file_is_straightened_or_stretched_at_its_length(kind: str, render: Renders) -> None:
-    points = [lps((24.5, 5.5, k)) for k in (1, 8, 15)]
+    points = [lps((24.5, 5.5, k)) for k in (1, 8, 15)]  # upwards through the block, which begins at k = 11
     (render.folder / "line.csv").write_text("x,y,z\n" + "\n".join(",".join(map(str, point)) for point in points))
     image, report = render("--curve", render.folder / "line.csv", "--cpr", kind)
     assert (report["mode"], report["pictures"][0]["curve"]["kind"]) == ("cpr", kind)
@@ -410,7 +410,7 @@ def test_turntable_into_a_gif_has_its_frames_and_bytes_in_the_report(render: Ren
     assert report["pictures"] == []
 
 
-def test_turntable_into_a_folder_has_frames_from_all_sides(render: Renders) -> None:
+def test_turntable_into_a_folder_has_a_frame_from_the_front_and_one_from_behind(render: Renders) -> None:
     _, report = render("--turntable", render.folder / "frames", "--frames", "4")
 
     assert report["turntable"]["output"]["format"] == "folder"

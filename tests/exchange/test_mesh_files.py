@@ -511,7 +511,7 @@ def test_check_of_a_vtp_with_a_wrong_end_names_the_end_that_is_missing(mesh, tmp
 
 def test_mesh_too_large_for_its_format_is_refused_with_formats_that_hold_it(mesh, tmp_path, monkeypatch):
     monkeypatch.setitem(FORMATS, ".stl", dataclasses.replace(FORMATS[".stl"], most_bytes=5000))
-    with refused(OutputError, "PLY", "VTP", 4):
+    with refused(OutputError, "PLY", "VTP", 4):  # GiB, of which the words are, whatever the number here
         mesh.save(tmp_path / "bone.stl")
     assert list(tmp_path.iterdir()) == []
 

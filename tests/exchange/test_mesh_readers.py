@@ -375,7 +375,7 @@ def test_mesh_file_with_impossible_content_is_refused_in_one_line(
 
 
 @pytest.mark.parametrize("extension", [".obj", ".glb", ".3mf", ".vtp"])
-def test_mesh_file_cut_anywhere_is_refused_unless_it_is_an_obj_cut_between_lines(
+def test_mesh_file_cut_at_forty_places_is_refused_unless_it_is_an_obj_cut_between_lines(
     extension: str, tmp_path: Path
 ) -> None:
     """Nothing tells that an OBJ was cut between two lines; the last bytes of VTP are no data, and are not cut here."""

@@ -166,6 +166,7 @@ def test_points_that_are_not_n_by_3_are_refused(points):
 def test_the_largest_coordinate_is_that_of_the_outermost_layer(axis, border, side):
     affine = np.diag((side * 2.0, side * 4.0, side * 8.0, 1.0))
     affine[axis, 3] = -1000.0  # the other coordinates are small
-    first, last = -border, (4, 3, 2)[axis] - 1 + border
+    columns_rows_slices = (4, 3, 2)
+    first, last = -border, columns_rows_slices[axis] - 1 + border
     ends = [-1000.0 + side * (2.0, 4.0, 8.0)[axis] * n for n in (first, last)]
     assert largest_coordinate(Volume(np.zeros((2, 3, 4), np.int16), affine), border=border) == max(np.abs(ends))

@@ -23,7 +23,7 @@ def test_slices_of_a_certificate_are_even_and_none_is_missing_by_default():
     assert (certificate.uneven, certificate.slices_missing) == (False, 0)
 
 
-def test_a_certificate_is_equal_to_the_dictionary_of_its_entries_and_to_no_other():
+def test_a_certificate_is_equal_to_the_dictionary_of_its_entries_and_not_to_one_that_differs_in_an_entry():
     certificate = certificate_of_needed_entries()
     assert certificate == {**certificate}
     assert certificate != {**certificate, "slices": 1}

@@ -179,6 +179,6 @@ def test_indented_numbers_of_a_page_are_read_with_half_a_unit_of_their_last_digi
     assert numbers["s"].half_a_digit == pytest.approx(0.0005)
 
 
-def test_a_slice_step_that_is_wrong_in_its_third_digit_is_off_by_more_than_its_last_digit(computed):
+def test_a_slice_step_that_is_wrong_in_its_third_digit_is_off_by_more_than_half_a_unit_of_it(computed):
     wrong, half_a_digit = read_numbers("    s = (0.493, -0.655, 0.980)\n")["s"]
     assert np.abs(wrong - computed["s"]).max() > half_a_digit

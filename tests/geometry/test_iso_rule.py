@@ -93,7 +93,7 @@ def test_the_value_outside_of_a_surface_below_a_level_is_as_far_above_as_the_low
     ("level", "below", "outside"),
     [(-(2**29), False, -(2**29) - 1), (-(2**31), False, -(2**30)), (2**29, True, 2**29), (2**31, True, 2**30)],
 )
-def test_the_value_outside_fits_32_bits_with_every_integer(level, below, outside):
+def test_the_value_outside_of_integers_lies_within_2_to_the_30_on_either_side_of_0(level, below, outside):
     assert choose_iso_rule(make_volume(low=-1000, high=900), level, below=below).outside == outside
 
 
@@ -196,7 +196,7 @@ def test_the_ends_of_a_range_of_integers_lie_half_a_unit_beyond_and_those_of_flo
 
 
 @pytest.mark.parametrize("level", [200, 200.0, np.int16(200), np.float32(200.0), np.array(200)])
-def test_a_number_of_any_kind_is_one_level(level):
+def test_a_number_of_python_or_numpy_is_one_level(level):
     assert choose_iso_rule(make_volume(low=-1000, high=900), level) == choose_iso_rule(
         make_volume(low=-1000, high=900), 200
     )

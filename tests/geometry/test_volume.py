@@ -55,7 +55,7 @@ def test_device_types_are_kept_without_a_copy(dtype):
     ("given", "kept"),
     [("bool", "uint8"), ("float64", "float32"), ("int64", "int32"), (">i2", "int16"), ("uint32", "int32")],
 )
-def test_voxels_of_other_types_are_converted_once(given, kept):
+def test_voxels_of_other_types_are_converted_with_their_values(given, kept):
     voxels = np.arange(24).reshape(2, 3, 4).astype(given)
     volume = Volume(voxels, np.eye(4))
     assert volume.voxels.dtype == np.dtype(kept)

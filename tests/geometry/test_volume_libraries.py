@@ -15,6 +15,7 @@ import clrecon
 from clrecon import LabelMap, OutputError, UsageError, Volume
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import AIR_HU, compose_affine, is_left_handed
+from clrecon.geometry.resample import MOST_VOXELS
 
 pyvista = pytest.importorskip("pyvista")
 sitk = pytest.importorskip("SimpleITK")
@@ -315,6 +316,7 @@ def test_a_ramp_in_uneven_slices_is_the_ramp_once_resampled(library, uneven_ramp
 def test_resampling_slices_too_near_for_a_grid_is_refused_with_their_number():
     table = np.array([(0, 0, 0), (0, 0, 1e-4), (0, 0, 100.0)])  # over 100 mm, in steps of 1e-4 mm
     volume = Volume(np.zeros((3, 50, 50), np.int16), np.diag((1.0, 1.0, 50.0, 1.0)), slice_positions=table)
+    assert 50 * 50 * (100 / 1e-4 + 1) > MOST_VOXELS
     with refused(RefusedInputError, 50, 100 / 1e-4 + 1):
         volume.to_pyvista(resample=True)
 
@@ -356,7 +358,7 @@ def test_an_image_of_pyvista_in_an_unknown_frame_is_refused(image_in_ras):
 
 
 @pytest.mark.parametrize("name", ["oblique", "left-handed"])
-def test_voxels_of_a_part_of_an_image_of_pyvista_lie_where_they_did(name):
+def test_first_and_last_voxel_of_a_part_of_an_image_of_pyvista_lie_where_they_did(name):
     volume = numbered_volume(AFFINES[name])
     part = Volume.from_pyvista(volume.to_pyvista().extract_subset((1, 2, 0, 3, 2, 4)))
     first, last = (0, 0, 0), (1, 3, 2)
