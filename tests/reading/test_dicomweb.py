@@ -432,7 +432,7 @@ def test_redirection_back_from_another_host_stays_without_credentials(
         ("", RefusedInputError, "127.0.0.1"),
     ],
 )
-def test_redirection_out_of_the_encrypted_web_is_refused(
+def test_redirection_to_another_scheme_a_host_in_the_clear_or_no_address_is_refused(
     location: str, kind: type[ClreconError], host: str, archive: Archive
 ) -> None:
     archive.answers = [answering(status=302, Location=location)]

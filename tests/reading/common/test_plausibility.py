@@ -73,7 +73,6 @@ def test_intercept_that_is_missing_or_doubled_is_warned_of(tmp_path, intercept, 
 def test_missing_intercept_is_warned_of_beside_declared_padding(tmp_path):
     """Declared padding goes to -1024 where no air is beside it, and says nothing of the scan."""
     hu = make_scan()
-    hu[:, :6] = -976  # stored 48; padding below is put there as a stored value
     plan = Plan(shape=SHAPE)
 
     def change(ds, k):
@@ -244,14 +243,16 @@ def test_volume_of_declared_padding_alone_is_refused(tmp_path):
 
 def test_volume_of_two_values_has_no_warning(tmp_path):
     hu = np.full(SHAPE, 40.0)
-    hu[3, 5, 5] = 41
+    hu[3, 5, 7] = 41
     assert read_warnings(write_hu(tmp_path, hu)) == []
 
 
 # --- no false alarms ---
-def test_padding_of_a_volume_of_210_voxels_is_not_warned_of(tmp_path):
-    hu = np.where(np.arange(210).reshape(7, 5, 6) % 3 == 0, -2000.0, 40.0)
-    assert read_warnings(write_hu(tmp_path, hu)) == []
+@pytest.mark.parametrize(("shape", "is_warned_of"), [((3, 9, 37), False), ((4, 10, 25), True)], ids=["999", "1000"])
+def test_padding_is_warned_of_in_volumes_from_1000_voxels_on(tmp_path, shape, is_warned_of):
+    """Of fewer voxels no share is stated."""
+    hu = np.where(np.arange(np.prod(shape)).reshape(shape) % 3 == 0, -2000.0, 40.0)
+    assert any("at -2000 HU" in warning for warning in read_warnings(write_hu(tmp_path, hu))) is is_warned_of
 
 
 def test_ct_of_another_scanner_has_no_warning_of_its_voxels():

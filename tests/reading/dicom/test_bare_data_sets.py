@@ -115,7 +115,7 @@ def test_files_that_are_no_dicom_are_refused_with_force_too(tmp_path, content):
 
 @pytest.mark.fault_row(36)
 def test_bare_enhanced_image_is_refused_with_force_too(tmp_path):
-    (tmp_path / "image").write_bytes(cut_all(save_bytes(make_enhanced(PLAN))))
+    (tmp_path / "frames").write_bytes(cut_all(save_bytes(make_enhanced(PLAN))))
     with refused(RefusedInputError, "image", "header"):
         read_volume(tmp_path, force=True)
 

@@ -168,7 +168,7 @@ def test_one_slice_of_a_series_is_refused_with_the_advice_to_name_the_folder(tmp
 
 
 @pytest.mark.parametrize("text", ["65537", "2147483647"])
-def test_implausible_numbers_of_frames_are_refused(tmp_path, text):
+def test_numbers_of_frames_beyond_65536_are_refused(tmp_path, text):
     ds = make_frames()
     set_raw("NumberOfFrames", text)(ds, 0)
     save_dataset(ds, tmp_path / "scan")

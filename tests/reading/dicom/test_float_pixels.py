@@ -86,7 +86,7 @@ def test_declared_float_padding_is_read_as_air(tmp_path, width, value, limit):
 def test_slice_with_a_nan_infinite_or_huge_voxel_is_refused_by_its_name_and_values(tmp_path, value, facts):
     def spoil(array, k):
         if k == 3:
-            array[2, 2] = value
+            array[2, 4] = value
         return array
 
     write_series(tmp_path, SEVEN_SLICES, set_floats(spoil))

@@ -130,22 +130,25 @@ def test_head_of_pixel_data_of_undefined_length_in_implicit_vr_has_length_minus_
 
 
 def fragments(count: int) -> io.BytesIO:
-    """So many empty items, and the end mark."""
+    """So many empty items, which one frame in RLE may have, and the end mark."""
     items = struct.pack("<HHL", 0xFFFE, 0xE000, 0) * count
     return io.BytesIO(items + struct.pack("<HHL", 0xFFFE, 0xE0DD, 0))
 
 
+MOST_ITEMS = 1000 * (1 + 1)
+"""A thousand a frame, of which there is one, and as many beside them; the first item is the table of offsets."""
+
+
 def test_frame_of_1999_fragments_is_found():
-    """The first item is the table of offsets; a frame in RLE may have several fragments."""
-    file = fragments(1 + 1999)
+    file = fragments(MOST_ITEMS)
     size = len(file.getvalue())
     frames = transfer_syntaxes.find_frames(file, start=0, file_bytes=size, frames=1, transfer_syntax=RLE)
     assert [len(pieces) for pieces in frames] == [1999]
 
 
 def test_frame_of_2000_fragments_is_refused():
-    file = fragments(1 + 2000)
-    with refused(RefusedInputError, 2000):
+    file = fragments(MOST_ITEMS + 1)
+    with refused(RefusedInputError, MOST_ITEMS):
         transfer_syntaxes.find_frames(file, start=0, file_bytes=len(file.getvalue()), frames=1, transfer_syntax=RLE)
 
 

@@ -65,7 +65,7 @@ def test_each_header_of_a_large_tree_is_read_once_from_its_start_in_little_memor
 
     monkeypatch.setattr(disk, "read_start", count_start)
     monkeypatch.setattr(scan, "read_headers", lambda *given, **how: parses.append(1) or heads(*given, **how))  # type: ignore[func-returns-value]
-    monkeypatch.setattr(elements, "parse_carefully", None)
+    monkeypatch.setattr(elements, "parse_carefully", None)  # plain headers: a call of it fails
     calls: list[tuple[str, int, int]] = []
 
     gc.collect()

@@ -370,7 +370,10 @@ def test_contrast_medium_in_a_vessel_of_every_second_slice_is_found_in_its_part(
     ids=["16 slices, 1 place", "16 slices, 3 places", "16 slices, 4 places", "30 slices, 1 place"],
 )
 def test_part_that_alternates_is_a_second_volume_over_many_slices_or_in_four_places(slices, places, is_mixed):
-    """Artefacts at a saw cut turn from slice to slice: they are few, or in few places."""
+    """Artefacts at a saw cut turn from slice to slice: they are few, or in few places.
+
+    One place must alternate over 20 slices, four places over 12.
+    """
     hu = widening_body(48)[16:].astype(np.int16)  # its outline moves beside the parts that alternate
     for j, i in [(44, 44), (44, 72), (72, 44), (72, 72)][:places]:  # parts are 32 pixels wide
         hu[1 : slices + 1 : 2, j : j + 12, i : i + 12] += 200
@@ -381,7 +384,7 @@ def test_part_that_alternates_is_a_second_volume_over_many_slices_or_in_four_pla
 
 @pytest.mark.parametrize(("windows", "is_mixed"), [(1, False), (2, True)], ids=["one window", "two windows"])
 def test_part_that_alternates_is_a_second_volume_in_two_windows_of_a_long_stack(windows, is_mixed):
-    """The windows begin at 0, 48 and 96."""
+    """The windows of 32 slices begin at 0, 48 and 96."""
     hu = widening_body(48)[16:].astype(np.int16)  # its outline moves beside the part that alternates
     stack = np.concatenate([hu, hu, hu, hu])
     stack[1 : 32 + 48 * (windows - 1) : 2, 44:56, 44:56] += 200

@@ -105,7 +105,7 @@ def test_iso_value_in_noisy_air_crosses_the_border_of_padding_no_more_than_the_a
     volume = read_volume(tmp_path)
     outside = outside_of_circle()
     y, x = np.mgrid[: SHAPE[1], : SHAPE[2]]
-    air = ~outside & (((x - CENTRE) / 12) ** 2 + ((y - CENTRE) / 9) ** 2 > 1)
+    air = ~outside & (((x - CENTRE) / 12) ** 2 + ((y - CENTRE) / 9) ** 2 > 1)  # a voxel beside the body, 11 x 8
     for iso_value in SWEEP:
         at_border = crossed_share(volume.voxels, iso_value, pairs_between(outside, ~outside))
         in_air = crossed_share(volume.voxels, iso_value, pairs_between(air, air))

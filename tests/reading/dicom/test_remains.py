@@ -109,7 +109,7 @@ def test_packed_file_refuses_the_series_where_the_slice_of_its_name_is_missing(t
         read_volume(tmp_path)
 
 
-def damage_last_under_another_name(folder, more_bytes=0):
+def damage_last_under_another_name(folder, more_bytes):
     """The last slice becomes random bytes, of its size and some more, under a name that no slice has."""
     plan = write_series(folder, plan_with("IM0001"))
     last = folder / plan.name(COUNT - 1)
@@ -118,14 +118,16 @@ def damage_last_under_another_name(folder, more_bytes=0):
     (folder / "FOUND.CHK").write_bytes(content + bytes(more_bytes))
 
 
-def test_damaged_file_as_large_as_a_slice_refuses_the_series_under_any_name(tmp_path):
-    damage_last_under_another_name(tmp_path)
+@pytest.mark.parametrize("more_bytes", [0, 256])
+def test_damaged_file_up_to_256_bytes_larger_than_a_slice_refuses_the_series_under_another_name(tmp_path, more_bytes):
+    """Headers of slices differ by a few digits."""
+    damage_last_under_another_name(tmp_path, more_bytes)
     with refused(RefusedInputError, "FOUND.CHK", "DICOM"):
         read_volume(tmp_path)
 
 
-def test_damaged_file_larger_than_a_slice_is_nobodys_slice_under_another_name(tmp_path):
-    damage_last_under_another_name(tmp_path, more_bytes=300)
+def test_damaged_file_more_than_256_bytes_larger_than_a_slice_is_nobodys_slice_under_another_name(tmp_path):
+    damage_last_under_another_name(tmp_path, more_bytes=256 + 1)
     assert read_volume(tmp_path).report["warnings"] == []
 
 
@@ -238,6 +240,7 @@ def test_file_of_any_size_beside_slices_of_one_size_and_a_broken_one_is_a_remain
 
 
 def test_file_of_three_bytes_beside_a_broken_slice_is_no_remain(tmp_path):
+    """It has neither a name like those of slices nor their size."""
     write_series(tmp_path, plan_with("IM0001"), set_values(only=COUNT - 1, Modality="C_T"))
     (tmp_path / "notes").write_bytes(b"a\0b")
     scan = scan_path(tmp_path)

@@ -60,6 +60,7 @@ def test_series_with_the_thinnest_slices_is_read_of_those_of_similar_size(tmp_pa
 def test_far_larger_series_is_read_though_it_is_derived(tmp_path):
     write_candidate(tmp_path, 1, slices=9, angles=CORONAL, thickness=2, image_type=DERIVED)
     write_candidate(tmp_path, 2, slices=4, angles=AXIAL, thickness=1, image_type=["ORIGINAL", "PRIMARY"])
+    # Less than half as many slices are not of similar size.
     assert read_volume(tmp_path).report["series"]["number"] == 1
 
 

@@ -58,7 +58,7 @@ def test_series_with_a_slice_cut_anywhere_is_refused_unless_no_pixel_is_lost(tmp
 
 @pytest.mark.fuzz
 @pytest.mark.parametrize("name", daily(1, SEEDS))
-def test_file_cut_at_every_byte_is_listed_with_a_problem_or_refused(tmp_path, name):
+def test_file_cut_within_its_header_or_pixels_is_listed_with_a_problem_or_refused(tmp_path, name):
     seed = SEEDS[name]
     outcomes = set()
     for length in lengths_to_cut(seed)[:: 1 if len(seed.series) > 1 else 2]:

@@ -53,7 +53,7 @@ def test_writing_a_volume_returns_the_bytes_of_its_file(tmp_path, name):
     assert write_volume(read_scan(tmp_path, "oblique"), tmp_path / name) == (tmp_path / name).stat().st_size
 
 
-def test_isal_and_zlib_pack_the_same_bytes(tmp_path, monkeypatch):
+def test_files_packed_by_isal_and_by_zlib_unpack_to_the_same_bytes(tmp_path, monkeypatch):
     pytest.importorskip("isal")
     volume = read_scan(tmp_path, "oblique")
     write_volume(volume, tmp_path / "isal.nii.gz")

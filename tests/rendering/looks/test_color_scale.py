@@ -67,7 +67,8 @@ def test_scale_is_added_at_the_right_of_an_opaque_picture(with_scale: Rendering)
 
 
 def test_strip_of_a_scale_has_its_colours_with_the_highest_value_at_the_top(with_scale: Rendering) -> None:
-    middle_of_strip = 300 + 9 + 16 // 2  # the picture, a gap, half of the strip
+    # Beside the 300 columns of the picture, in text of 400 / 36 = 11.1 pixels: a gap of 0.8, half of a strip of 1.4.
+    middle_of_strip = 300 + 9 + 16 // 2
     strip = with_scale.image[:, middle_of_strip, :3].astype(int)
 
     values = (1.9, 1.0, 0.0, -1.0, -1.9)

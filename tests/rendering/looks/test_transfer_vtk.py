@@ -46,7 +46,7 @@ def test_colours_and_opacities_of_vtk_are_those_of_the_transfer_function(of_step
 
 def test_gradient_opacity_of_vtk_is_in_hu_per_voxel(of_stepped) -> None:
     _, prop = of_stepped
-    step = 40 * 0.5  # HU per mm times mm per voxel
+    step = 40 * 0.5  # HU per mm of the step from 0.1 to 1, times mm per voxel
     factors = [prop.GetGradientOpacity().GetValue(x) for x in (step - 0.1, step, step + 10)]
     assert factors == pytest.approx([0.1, 1, 1])
 

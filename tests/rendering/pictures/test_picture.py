@@ -58,10 +58,10 @@ def test_png_without_a_camera_has_a_resolution_where_the_report_has_the_size_of_
 
 @pytest.mark.parametrize(("pixel_mm", "told"), [(4.7e-7, True), (4.6e-7, False), (999.0, True), (1001.0, False)])
 def test_pixels_too_small_or_large_for_the_resolution_of_png_are_saved_without_it(tmp_path, pixel_mm, told):
-    """PNG has 32 bits for pixels a metre."""
+    """PNG has 31 bits for the whole number of pixels a metre: at most 1000 mm a pixel, and at least 1000 / 2^31 mm."""
     picture = make_picture(camera=None)
     picture.report["pixel_mm"] = pixel_mm
-    image_files.write_floats(picture.depth, tmp_path / "d.tif", pixel_mm)
+    image_files.write_floats(picture.depth, tmp_path / "d.tif", pixel_mm)  # TIFF takes any
     picture.save(tmp_path / "a.tif")
     picture.save(tmp_path / "a.png")
     with Image.open(tmp_path / "a.png") as read:
