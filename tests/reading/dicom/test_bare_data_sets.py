@@ -148,7 +148,7 @@ def test_bare_slices_with_long_headers_are_read_with_force(tmp_path):
 def test_bare_slice_with_a_long_header_that_lacks_its_last_byte_is_refused_with_both_sizes(tmp_path):
     write_bare_with_long_headers(tmp_path)
     (tmp_path / "1").write_bytes((tmp_path / "1").read_bytes()[:-1])
-    pixel_bytes = 3 * 4 * 2
+    pixel_bytes = 3 * 4 * 2  # rows, columns, and the bytes of a pixel
     with refused(RefusedInputError, 1, pixel_bytes, pixel_bytes - 1):
         read_volume(tmp_path, force=True)
 

@@ -34,6 +34,7 @@ def warnings_and_failed_gates(folder):
     ids=["too small", "too large", "a metre", "every second one lost"],
 )
 def test_implausible_spacing_fails_its_gate_with_a_warning(tmp_path, plan, gate, words):
+    """Pixels of 0.005 to 10 mm are plausible."""
     write_series(tmp_path, plan, set_values(SliceThickness=5))
     warnings, failed = warnings_and_failed_gates(tmp_path)
     assert gate in failed
@@ -44,6 +45,7 @@ def test_implausible_spacing_fails_its_gate_with_a_warning(tmp_path, plan, gate,
     "plan", [Plan(pixel_spacing=(0.006, 0.006), gap=0.006), Plan(gap=9.7)], ids=["micro-CT", "1.94 times the thickness"]
 )
 def test_unusual_but_plausible_spacing_passes_its_gates(tmp_path, plan):
+    """Above 0.005 mm, and below 1.95 times the thickness."""
     write_series(tmp_path, plan, set_values(SliceThickness=5))
     _, failed = warnings_and_failed_gates(tmp_path)
     assert not {"plausible_spacing", "gap_thickness"} & set(failed)

@@ -393,9 +393,14 @@ def test_part_that_alternates_is_a_second_volume_in_two_windows_of_a_long_stack(
     assert likeness.is_mixed is is_mixed
 
 
-@pytest.mark.parametrize("hu", [widening_body(5), widening_body(24)[:, :7, :7]], ids=["five slices", "seven pixels"])
-def test_likeness_of_too_few_slices_or_pixels_is_not_measured(hu):
-    assert measure_likeness(hu.astype(np.int16)) is None
+@pytest.mark.parametrize(
+    ("hu", "is_measured"),
+    [(widening_body(5), False), (widening_body(6), True), (widening_body(24)[:, :7, :7], False),
+     (widening_body(24)[:, :8, :8], True)],
+    ids=["5 slices", "6 slices", "7 pixels", "8 pixels"],
+)  # fmt: skip
+def test_likeness_is_measured_from_six_slices_and_eight_pixels_a_side_on(hu, is_measured):
+    assert (measure_likeness(hu.astype(np.int16)) is not None) is is_measured
 
 
 @pytest.mark.release

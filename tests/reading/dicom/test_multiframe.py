@@ -436,7 +436,7 @@ def test_concatenation_whose_part_starts_too_late_is_refused_with_its_frames(tmp
 # --- other opinions ---
 
 
-def test_highdicom_reads_the_same_volume_of_an_enhanced_image(tmp_path):
+def test_corners_of_an_enhanced_image_have_the_places_and_values_that_highdicom_reads(tmp_path):
     highdicom = pytest.importorskip("highdicom")  # not there for Python 3.14
 
     plan = Plan(tilt_deg=0, angles=(20, -35, 50))
@@ -450,7 +450,8 @@ def test_highdicom_reads_the_same_volume_of_an_enhanced_image(tmp_path):
     lps = volume.ijk_to_lps(corners)
     index = np.rint(theirs.map_reference_to_indices(lps)).astype(int)
     assert np.abs(theirs.map_indices_to_reference(index) - lps).max() < AFFINE_MM
-    ours = volume.voxels[corners[:, 2], corners[:, 1], corners[:, 0]]
+    i, j, k = corners.T
+    ours = volume.voxels[k, j, i]
     assert np.array_equal(theirs.array[tuple(index.T)], ours)
 
 

@@ -46,6 +46,7 @@ def test_native_transfer_syntaxes_give_the_same_hu(tmp_path, syntax):
 
 
 def test_slices_with_a_header_of_200_kb_are_read(tmp_path):
+    """More than the 16 KiB that are read first."""
     plan = write_series(tmp_path, change=lambda ds, k: ds.add_new(0x00420011, "OB", bytes(200_000)))
     assert np.array_equal(read_volume(tmp_path).voxels, plan.hu())
 

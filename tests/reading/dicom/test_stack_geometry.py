@@ -120,6 +120,7 @@ def test_stack_with_holes_or_of_one_slice_is_refused_in_one_line(tmp_path, plan,
     with pytest.raises(RefusedInputError) as refusal:
         read_volume(tmp_path)
     assert_one_line(refusal.value)
+    assert words in str(refusal.value)
 
 
 @STACKS_WITH_HOLES

@@ -69,7 +69,7 @@ def test_big_endian_nifti_is_read(tmp_path, kind, stored):
     header.set_data_dtype(stored)
     image = getattr(nibabel, f"{kind}Image")(make_ct().transpose(2, 1, 0).astype(stored), RAS @ OBLIQUE, header)
     nibabel.save(image, tmp_path / "a.nii")
-    assert (tmp_path / "a.nii").read_bytes()[:2] == b"\0\0"
+    assert (tmp_path / "a.nii").read_bytes()[:2] == b"\0\0"  # of the size of the header, 348 or 540, big end first
     assert np.array_equal(clrecon.read_volume(tmp_path / "a.nii").voxels, make_ct())
 
 
@@ -84,7 +84,7 @@ def test_fractions_are_read_as_float32(tmp_path, name, stored):
 
 @pytest.mark.parametrize("k", [0, 2, 3])
 @pytest.mark.parametrize(("value", "dtype"), [(40_000.0, "i4"), (-3.0e6, "i4"), (12.25, "f4"), (1e12, "f4")])
-def test_value_beyond_int16_in_one_slice_widens_the_type_of_the_whole_volume(tmp_path, k, value, dtype):
+def test_value_that_int16_cannot_hold_in_one_slice_widens_the_type_of_the_whole_volume(tmp_path, k, value, dtype):
     voxels = make_ct().astype(np.float64)
     voxels[k, 3, 2] = value
     volume = clrecon.read_volume(write_nifti(tmp_path / "a.nii.gz", voxels))

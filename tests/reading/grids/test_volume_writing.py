@@ -228,6 +228,6 @@ def test_uneven_slices_are_written_resampled_on_request(tmp_path):
 
 
 @pytest.mark.parametrize("spacing", [0.0, -1.0, np.nan, 0.001])
-def test_spacing_below_a_hundredth_of_a_mm_is_refused_for_resampling(spacing):
+def test_spacing_that_is_no_hundredth_of_a_mm_or_more_is_refused_for_resampling(spacing):
     with refused(UsageError, 0.01):
         resample_volume(uneven(), spacing)

@@ -105,6 +105,7 @@ def test_pixel_of_a_slice_has_the_label_of_the_voxel_that_it_lies_in() -> None:
 
     numbers = labels_on_sheet(LABELS, sheet)
 
+    # The middle of the first voxel lies at 0 mm.
     i, j, k = np.moveaxis(np.floor(sheet.points() / LABELS.spacing + 0.5).astype(int), -1, 0)
     inside = (0 <= i) & (i < 12) & (0 <= j) & (j < 10) & (0 <= k) & (k < 4)
     expected = np.zeros((40, 40), int)

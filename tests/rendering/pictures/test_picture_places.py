@@ -50,14 +50,17 @@ def test_picture_is_copied_into_an_array_of_another_type_or_on_request(ball_pict
 
 
 @pytest.mark.parametrize(
-    ("plane", "middle", "ways"),
-    [("axial", (3.5, 2.5), (1, 1)), ("coronal", (3.5, 1.5), (1, -1)), ((30, 20), (0, 0), (1, -1))],
+    ("plane", "edges"),  # left, right, bottom, top
+    [
+        pytest.param("axial", (3.5 - 5, 3.5 + 5, 2.5 + 2.5, 2.5 - 2.5), id="along x, and down along y"),
+        pytest.param("coronal", (3.5 - 5, 3.5 + 5, 1.5 - 2.5, 1.5 + 2.5), id="along x, and up along z"),
+        pytest.param((30, 20), (-5, 5, -2.5, 2.5), id="oblique, from its middle"),
+    ],
 )
-def test_edges_of_a_plane_are_mm_of_the_axes_that_it_runs_along(device, plane, middle, ways):
-    volume = clrecon.Volume(np.zeros((4, 6, 8), np.int16), np.eye(4))
+def test_edges_of_a_plane_are_mm_of_the_axes_that_it_runs_along(device, plane, edges):
+    volume = clrecon.Volume(np.zeros((4, 6, 8), np.int16), np.eye(4))  # its middle: x 3.5, y 2.5, z 1.5 mm
     cut = clrecon.cut_slice(volume, plane, size=(20, 10), pixel_mm=0.5, device=device)  # 10 mm wide, 5 mm high
-    (across, down), (right, below) = middle, ways
-    assert cut.extent == pytest.approx((across - 5 * right, across + 5 * right, down + 2.5 * below, down - 2.5 * below))
+    assert cut.extent == pytest.approx(edges)
 
 
 def test_edges_in_mm_of_a_perspective_picture_are_refused(ball_picture):
