@@ -10,6 +10,7 @@ from refusals import refused
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.mesh import Mesh, select_components, split_components
+from clrecon.mesh.components import SEED_REACH_MM
 from clrecon.mesh.connectivity import label_components
 from clrecon.mesh.quality import measure_components
 from clrecon.mesh.triangles import enclosed_ml
@@ -218,8 +219,9 @@ def test_split_into_as_many_components_as_allowed_is_not_refused():
 
 
 def test_split_into_more_components_than_allowed_is_refused():
-    found, allowed, advised_ml = 3, 2, 0.1
-    with refused(UsageError, "min_volume_ml=ML", found, allowed, advised_ml):
+    found, allowed = 3, 2
+    crumb_ml = 0.1  # all three boxes are below it, and are counted: no least volume can be advised
+    with refused(UsageError, "min_volume_ml=ML", found, allowed, crumb_ml):
         split_components(three_boxes(), most=allowed)
 
 
@@ -265,13 +267,16 @@ def test_split_returns_the_component_nearest_to_a_seed():
     assert piece.quality()["volume_ml"] == pytest.approx(MIDDLE_ML)
 
 
-def test_a_seed_30_mm_from_every_component_is_refused_with_its_distance():
-    with refused(UsageError, "LPS", 531, 0.5, 30.0):
-        select_components(three_boxes(), seeds=[ON_THE_LARGE_BOX, (531, 0.5, 0.5)])
+def test_a_seed_further_than_its_reach_from_every_component_is_refused_with_its_distance():
+    end_of_the_small_box, beyond = 501.0, SEED_REACH_MM + 0.5
+    with refused(UsageError, "LPS", beyond, SEED_REACH_MM):
+        select_components(three_boxes(), seeds=[ON_THE_LARGE_BOX, (end_of_the_small_box + beyond, 0.5, 0.5)])
 
 
-def test_a_seed_19_mm_from_a_component_keeps_it():
-    assert select_components(three_boxes(), seeds=[(520.0, 0.5, 0.5)]).report["components_kept"] == 1
+def test_a_seed_as_far_as_its_reach_from_a_component_keeps_it():
+    end_of_the_small_box = 501.0
+    kept = select_components(three_boxes(), seeds=[(end_of_the_small_box + SEED_REACH_MM, 0.5, 0.5)])
+    assert kept.quality()["volume_ml"] == pytest.approx(SMALL_ML)
 
 
 @pytest.mark.parametrize("seed", [(1.0, 2.0), (1.0, 2.0, float("nan")), (1, 2, 3, 4)], ids=["two", "nan", "four"])
@@ -313,7 +318,7 @@ def test_known_labels_are_taken_in_place_of_the_connection_of_triangles():
 def test_equal_components_are_in_the_order_of_the_mesh_wherever_they_lie(reach_mm, seed):
     """Coordinates are rounded differently at each place, and so are areas."""
     centres = np.random.default_rng(seed).uniform(-reach_mm, reach_mm, (4, 3))
-    if reach_mm > 4096:  # float64 vertices were computed in float32 from a point near their centre
+    if reach_mm > 4096:  # mm: so far away a mesh lies around a point near to it, from which float32 counts
         centres = centres[0] + centres / 100
     vertices, triangles = samples.sphere((0, 0, 0), radius=7.3, rounds=3)
     mesh = Mesh(*samples.join(*[((vertices + centre).astype(np.float64), triangles) for centre in centres]))

@@ -73,7 +73,7 @@ def test_cache_folder_that_cannot_be_used_leaves_one_warning_and_no_file(device,
 
 @pytest.mark.parametrize("command", daily(2, ["devices", "render", "mesh"]))
 @pytest.mark.fault_row(59)
-def test_every_command_with_a_device_warns_once_of_an_unsafe_cache_folder(command, device, tmp_path, phantom_folder):
+def test_devices_render_and_mesh_warn_once_of_an_unsafe_cache_folder(command, device, tmp_path, phantom_folder):
     """The folder of pickles is refused; kernels are found as ever, so that nothing is built for this test."""
     make_faulty(tmp_path / "home" / "pytools", fault="others")
     arguments = {

@@ -15,6 +15,7 @@ from clrecon.opencl import allocate, download, kernel_files, launch, load_progra
 from clrecon.opencl.program import LAUNCHES_BEFORE_TYPES
 from clrecon.opencl.quirks import import_pyopencl
 from clrecon.opencl.sources import KernelArgument, definitions_of, find_signatures
+from clrecon.operators.primitives.scan import SCAN_PER_ITEM
 from clrecon.operators.resident.tables import BrickRanges, compare_bricks
 
 VARIANTS = [
@@ -28,7 +29,7 @@ VARIANTS = [
 
 
 def sum_blocks_kernel(device):
-    """The kernel that adds up the counts of each block of 16 for a work-item of a group."""
+    """The kernel that adds up the counts of each block: of as many as SCAN_PER_ITEM for each work-item of a group."""
     return load_program(device, "primitives/scan.cl", {"SCAN_GROUP": str(device.group_size)})["sum_blocks"]
 
 
@@ -45,7 +46,7 @@ def test_kernel_takes_its_arguments_by_name_in_any_order(device):
     launch(device, sum_blocks_kernel(device), device.group_size, **backwards)
 
     [block_sum] = download(device, np.empty(1, np.uint32), arguments["block_sums"])
-    counts_in_block = min(arguments["n"], 16 * device.group_size)
+    counts_in_block = min(arguments["n"], SCAN_PER_ITEM * device.group_size)
     assert block_sum == sum(range(counts_in_block))  # the counts are 0, 1, 2 ...
 
 

@@ -94,7 +94,7 @@ def test_array_larger_than_the_memory_is_refused_with_its_bytes():
         PagePool().empty((2**60,), np.float64)
 
 
-def test_arrays_of_several_threads_never_share_a_block():
+def test_arrays_that_eight_threads_use_at_once_share_no_block():
     pool = PagePool()
     shared = []
 

@@ -58,7 +58,7 @@ def test_every_kernel_file_builds_alone_with_the_kernels_that_it_declares(name, 
 
 
 @pytest.mark.parametrize("voxel", ["char", "uchar", "short", "ushort", "int", "float"])
-def test_kernels_build_for_every_voxel_type(voxel, device):
+def test_marching_cubes_build_for_voxels_of_8_to_32_bits(voxel, device):
     program = load_program(device, "surface/marching_cubes.cl", {"VOXEL": voxel})
     assert "emit_vertices" in program.kernel_names
 

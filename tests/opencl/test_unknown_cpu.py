@@ -48,7 +48,7 @@ def cpu_info(*flags: str) -> str:
 @pytest.mark.parametrize("name", [name for name, _ in CPU_NAMES])
 def test_cpu_gets_the_first_name_whose_flags_it_has(name):
     needed_flags = dict(CPU_NAMES)[name]
-    another_flag = "avx512_vnni" if name == "skx" else "avx"
+    another_flag = "avx512_vnni" if name == "skx" else "avx"  # which no name needs; only CPUs of AVX-512 have the first
     assert choose_name(cpu_info(*needed_flags, another_flag)) == name
 
 

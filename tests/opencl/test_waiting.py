@@ -189,7 +189,7 @@ def test_interrupt_keeps_the_context_of_a_device_only_if_its_kernel_ends_in_time
     device.commands.add("kernel one", event, QUEUE)
     monkeypatch.setattr(device._opened, "context", context)
     if ends_in_time:
-        threading.Timer(0.1, event.end).start()
+        threading.Timer(0.1, event.end).start()  # seconds; an interrupted kernel has 0.5
 
     with pytest.raises(KeyboardInterrupt):
         wait(device)

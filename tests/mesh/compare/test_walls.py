@@ -214,7 +214,10 @@ def even_slab(slice_mm: float) -> Volume:
 
 @pytest.mark.parametrize(("slice_mm", "is_flat"), [(1.0, True), (4.0, False)])
 def test_depths_are_in_voxels_along_the_normal(slice_mm, is_flat):
-    """A slab of even HU that ends 8 mm deep is flat beneath in slices of 1 mm, but not in slices of 4 mm."""
+    """A slab of even HU that ends 8 mm deep is flat beneath in slices of 1 mm, but not in slices of 4 mm.
+
+    A wall is flat where the HU are even from 1.5 to 4 voxels deep: down to 4 mm, and to 16 mm.
+    """
     assert look_into(even_slab(slice_mm), (1.5, 1.5, 20.6), (0, 0, 1), 100.0).flat.tolist() == [is_flat]
 
 

@@ -198,7 +198,7 @@ TALL = Volume(np.zeros((200, 1000, 33), np.int8), np.diag((1.0, 0.01, 0.01, 1.0)
 def test_a_radius_of_a_thousand_voxels_is_refused(device):
     """In voxels of 1 x 0.01 x 0.01 mm: hours of work."""
     mask = clrecon.Mask.from_band(TALL, (0, 1), device=device)
-    most_visits = 1e11
+    most_visits = 1e11  # of rows of the volume, that are allowed
     with refused(UsageError, "radius", most_visits):
         mask.dilate(10.0)
 

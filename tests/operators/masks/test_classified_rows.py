@@ -39,8 +39,9 @@ def test_inside_bits_and_extents_of_rows_equal_those_of_numpy(device_as_gpu, col
     volume = random_volume((3, 5, columns), dtype=dtype, high=100)
     volume.voxels[1, 2] = 0  # a row without bits
     volume.voxels[0, :, -1] = 99  # rows whose last bit is set
+    # The samples of a surface at 60 HU, all in one slab: a closed one has a border of a sample around the voxels.
     grid = SampleGrid(volume, choose_iso_rule(volume, 60, closed=closed))
-    slab = Slab(grid, first=0, end=3 + 2 * closed)  # a closed surface has a slice more at either end
+    slab = Slab(grid, first=0, end=3 + 2 * closed)
     level = np.dtype(dtype).type(grid.rule.lowest_inside)
 
     made = classify(device_as_gpu, slab, upload(device_as_gpu, volume.voxels), [level])

@@ -62,7 +62,7 @@ def test_filled_holes_of_rows_of_every_length_equal_scipy(device, columns):
 def test_growth_in_rows_of_every_length_equals_the_twin(device, columns):
     chosen = random_mask((4, 9, columns), density=0.62)
     mask = mask_of(device, chosen)
-    seeds = np.argwhere(chosen)[[0, -1]]
+    seeds = np.argwhere(chosen)[[0, -1]]  # k, j, i
     grown = mask.grow(mask.scan.ijk_to_lps(seeds[:, ::-1]))
     np.testing.assert_array_equal(grown.to_numpy(), twin.grow(chosen, seeds))
 
@@ -115,7 +115,7 @@ def test_a_shell_with_a_hole_through_its_wall_is_filled_slice_by_slice_alone(dev
 def test_growth_from_points_gives_the_components_of_scipy_that_hold_them(device, density):
     chosen = random_mask((9, 20, 70), density=density)
     labels, _ = ndimage.label(chosen)
-    seeds = np.argwhere(chosen)[[0, 40, -1]]
+    seeds = np.argwhere(chosen)[[0, 40, -1]]  # k, j, i
     mask = mask_of(device, chosen)
     grown = mask.grow(mask.scan.ijk_to_lps(seeds[:, ::-1]))
     np.testing.assert_array_equal(grown.to_numpy(), np.isin(labels, labels[tuple(seeds.T)]))
@@ -125,7 +125,7 @@ def test_growth_from_points_gives_the_components_of_scipy_that_hold_them(device,
 def test_growth_from_points_beside_voxels_of_an_uneven_stack_equals_the_twin(device):
     volume = uneven(random_mask((6, 9, 40), density=0.4).astype(np.int16))
     chosen = volume.voxels > 0
-    seeds = np.argwhere(chosen)[[3, -5]]
+    seeds = np.argwhere(chosen)[[3, -5]]  # k, j, i
     beside = volume.ijk_to_lps(seeds[:, ::-1]) + 0.05  # mm: the nearest voxels are the same
     grown = clrecon.Mask.from_band(volume, (1, 1), device=device).grow(beside)
     np.testing.assert_array_equal(grown.to_numpy(), twin.grow(chosen, seeds))

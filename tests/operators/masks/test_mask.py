@@ -219,7 +219,7 @@ def test_nan_for_the_voxels_outside_of_a_mask_is_refused(device, dtype):
 
 def test_surface_of_the_voxels_in_a_box_is_that_of_the_volume_with_air_elsewhere(device):
     volume = random_volume((8, 9, 40), high=100)
-    from_x = [volume.affine[0, 3] + 9.0, None, None, None, None, None]
+    from_x = [volume.affine[0, 3] + 9.0, None, None, None, None, None]  # mm: 9 from the first voxel on
     mask = clrecon.Mask.from_box(volume, from_x, device=device)
     with_air = volume.with_voxels(np.where(mask.to_numpy(), volume.voxels, -1024))
     found, expected, whole = (
@@ -358,7 +358,7 @@ def small_random_mask(device):
 def test_a_component_of_a_closed_opened_and_filled_mask_is_a_part_of_it(small_random_mask):
     mask = small_random_mask
     opened = mask.close(2.0).open(1.0).fill_holes() | mask.fill_holes(by_slice=True)
-    first_voxel = np.argwhere(opened.to_numpy())[:1, ::-1]
+    first_voxel = np.argwhere(opened.to_numpy())[:1, ::-1]  # k, j, i to i, j, k
     grown = opened.grow(mask.scan.ijk_to_lps(first_voxel))
     assert grown.count > 0
     assert (grown - opened).count == 0
