@@ -14,7 +14,7 @@ from refusals import refused
 from clrecon.errors import OutputError, UsageError
 from clrecon.rendering import movies
 from clrecon.rendering import movies as motion
-from clrecon.rendering.movies import check_animation, stage_animation, turntable_cameras, write_animation
+from clrecon.rendering.movies import MOST_FRAMES, check_animation, stage_animation, turntable_cameras, write_animation
 
 
 @pytest.fixture
@@ -60,7 +60,7 @@ def test_single_camera_of_a_turn_is_at_its_beginning():
     assert turntable_cameras(PARALLEL, frames=1, degrees=90.0) == [PARALLEL]
 
 
-@pytest.mark.parametrize(("frames", "degrees"), [(0, 360), (10**6, 360), (2.5, 360), (10, np.nan)])
+@pytest.mark.parametrize(("frames", "degrees"), [(0, 360), (MOST_FRAMES + 1, 360), (2.5, 360), (10, np.nan)])
 def test_turntable_of_an_impossible_number_of_frames_or_degrees_is_refused(frames, degrees):
     with refused(UsageError, "turntable"):
         turntable_cameras(PARALLEL, frames, degrees)
@@ -375,7 +375,7 @@ def test_mp4_by_an_ffmpeg_without_h264_is_refused(tmp_path, no_encoder):
 def test_mp4_by_an_encoder_that_fails_is_refused_and_leaves_no_file(tmp_path, no_encoder):
     fake_ffmpeg(tmp_path, 'case "$*" in *-encoders) echo " V libx264 "; exit;; esac; echo "No space left" >&2; exit 1')
     no_encoder.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
-    with refused(OutputError, "MP4"):
+    with refused(OutputError, "MP4", "space"):  # what the encoder said last
         write_animation(moving_frames(9, size=(640, 480)), tmp_path / "turn.mp4")
     assert names_in(tmp_path) == ["ffmpeg"]
 

@@ -217,7 +217,7 @@ def test_costs_of_a_call_are_its_cores_and_page_faults() -> None:
 
 @pytest.mark.parametrize(
     ("code", "timeout_s", "fact"),
-    [("import sys; sys.exit(3)", 60.0, 3), ("import time; time.sleep(60)", 0.2, 0.2)],
+    [("import sys; sys.exit(1 + 2)", 60.0, 3), ("import time; time.sleep(60)", 0.2, 0.2)],  # facts not in the code
     ids=["exit code 3", "over 0.2 s"],
 )
 def test_program_of_the_bench_that_fails_or_hangs_is_an_error(code: str, timeout_s: float, fact: float) -> None:

@@ -29,7 +29,7 @@ from python_changes import (
     statement_lines,
 )
 from refusals import refused
-from room_traces import FAR, Imports, Trace
+from room_traces import FAR, MOST_SECONDS, Imports, Trace
 from traced_tests import Caches
 from warm_tests import Run, WarmTests
 
@@ -184,9 +184,13 @@ def test_shortest_tests_within_some_seconds_are_chosen_and_at_least_one(seconds:
     assert TRACED.shortest(["x", "y[2]", "z"], seconds) == shortest
 
 
-def test_test_of_a_minute_is_left_out_where_a_shorter_one_runs_the_line() -> None:
-    trace = Trace({"a.py": {3: ["x", "y"]}}, {"x": 59.0, "y": 1.5}, START_S)
-    assert trace.tests_of("a.py", [3]) == ["y"]
+@pytest.mark.parametrize(("over_s", "chosen"), [(0.0, ["short", "long"]), (0.1, ["short"])], ids=["at most", "beyond"])
+def test_longer_test_is_left_out_where_it_and_the_shorter_one_take_more_than_most_seconds(
+    over_s: float, chosen: list[str]
+) -> None:
+    seconds = {"long": MOST_SECONDS - 1.5 + over_s, "short": 1.5}
+    trace = Trace({"a.py": {3: ["long", "short"]}}, seconds, START_S)
+    assert trace.tests_of("a.py", [3]) == chosen
 
 
 @pytest.fixture

@@ -161,7 +161,8 @@ def measure_ramp_bias(bone: Any) -> Any:
 
 def test_the_bias_of_a_ramp_is_the_way_from_its_half_maximum_to_the_level(ramp_bone: Any) -> None:
     bias = measure_ramp_bias(ramp_bone)
-    assert (bias.median_mm, bias.low_mm, bias.high_mm) == pytest.approx((0.5, 0.5, 0.5), abs=0.11)  # steps of 0.1 mm
+    way_mm = 6.0 - 5.5  # from 400 HU, half of the ramp, to 200 HU, the level
+    assert (bias.median_mm, bias.low_mm, bias.high_mm) == pytest.approx([way_mm] * 3, abs=0.11)  # steps of 0.1 mm
 
 
 def test_the_bias_is_measured_along_rays_all_round_evenly_spaced_stations_of_the_line(ramp_bone: Any) -> None:

@@ -419,9 +419,10 @@ def test_a_vertebra_without_an_arch_has_low_confidence_as_it_lacks_a_spinous_pro
     points = volume.ijk_to_lps(np.stack([i, j, k], axis=-1).reshape(-1, 3)).reshape(*k.shape, 3)
     _, y, z = np.moveaxis(points, -1, 0)
     l2 = split("T12-L3").vertebrae[2]
-    behind_the_body = y > l2.centre_mm[1] + 30.0
+    behind_the_body = y > l2.centre_mm[1] + 30.0  # mm
     at_its_height = np.abs(z - (l2.centre_mm[2] - 12.0)) < 24.0  # arches hang down
-    voxels = np.where(behind_the_body & at_its_height & (volume.voxels > 60), 40, volume.voxels)
+    soft_hu = 40  # in place of bone
+    voxels = np.where(behind_the_body & at_its_height & (volume.voxels > 60), soft_hu, volume.voxels)
 
     result = clrecon.split_vertebrae(Volume(voxels, volume.affine), keep_unsure=True)
 

@@ -37,9 +37,7 @@ sys.exit(main(sys.argv[1:]))
         ],
     ),
 )
-def test_every_command_that_writes_into_a_deleted_current_folder_is_refused_in_one_line(
-    command: str, tmp_path: Path
-) -> None:
+def test_command_that_writes_into_a_deleted_current_folder_is_refused_in_one_line(command: str, tmp_path: Path) -> None:
     call = [sys.executable, "-c", IN_A_DELETED_FOLDER, *command.split()]
     done = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True)
     target = command.split()[-1]

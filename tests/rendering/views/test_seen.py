@@ -76,8 +76,8 @@ def test_box_leaves_out_labels_that_are_hidden():
     assert extent(box) == between((14, 1, 8), (16, 3, 10))  # the block of 40 HU
 
 
-def test_box_ends_at_the_sides_of_a_clip_box():
-    clip = Clip.box((-10, -99, 0), (99, 99, 999))
+def test_box_ends_at_the_side_of_a_clip_box_that_cuts_the_volume():
+    clip = Clip.box((-10, -99, 0), (99, 99, 999))  # all but x = -10 mm lie beyond the volume
 
     box = find_seen_box(Volume(block(), AFFINE), SHOWN, clip=clip)
 
