@@ -157,7 +157,11 @@ MIDDLE_OF_THE_MESH = scenes.middle(0) + (0.0, -25.0, 0.0)
 
 
 @pytest.mark.parametrize("perspective", [False, True], ids=["parallel", "perspective"])
-@pytest.mark.parametrize(("number", "point"), [(1, scenes.middle(2)), (2, MIDDLE_OF_THE_MESH)], ids=["scan", "mesh"])
+@pytest.mark.parametrize(
+    ("number", "point"),
+    [(1, scenes.middle(2)), (2, MIDDLE_OF_THE_MESH)],
+    ids=["scan", "mesh before a ball of the scan"],
+)
 def test_pick_finds_the_nearest_object_in_each_projection(open_model_and_painter, perspective, number, point):
     model, painter = open_model_and_painter(scenes.make_scan(), scenes.make_mesh())
     model.set_perspective(on=perspective)

@@ -80,7 +80,7 @@ def test_part_of_a_ball_has_its_volume_its_box_and_a_point_in_it(open_model_and_
     ball_ml = 4 / 3 * np.pi * radius**3 / 1000.0
     assert part.ml == pytest.approx(ball_ml, rel=0.04)  # counted in voxels of about 1 mm; measured 0.019
     low, high = np.array(part.box)
-    voxel_mm = 1.5
+    voxel_mm = 1.5  # the longest side, 1.4 mm, and rounding
     assert (low <= middle - radius + voxel_mm).all()
     assert (high >= middle + radius - voxel_mm).all()
     assert np.linalg.norm(np.subtract(part.inside, middle)) < radius
@@ -125,8 +125,8 @@ def test_parts_of_the_two_last_iso_values_are_kept_whatever_their_size(open_mode
         model.set_iso(hu)
         find(model, painter)
         key, found = painter._found.popitem()
-        half_a_gigabyte = SimpleNamespace(voxels=np.broadcast_to(np.uint8(0), 2**29))
-        painter._found[key] = replace(found, labels=half_a_gigabyte)
+        half_a_gibibyte = SimpleNamespace(voxels=np.broadcast_to(np.uint8(0), 2**29))  # what all may take together
+        painter._found[key] = replace(found, labels=half_a_gibibyte)
     assert [key[1] for key in painter._found] == [300.0, 400.0]
 
 
@@ -140,7 +140,7 @@ def test_scan_without_a_voxel_at_the_iso_value_has_no_parts_of_bone(open_model_a
 @pytest.mark.parametrize("hidden", daily(1, [1, 2, 3]))
 def test_hidden_part_is_neither_in_the_picture_nor_in_the_mesh(open_model_and_painter, device, hidden, uneven):
     scan = scenes.make_scan()
-    if uneven:
+    if uneven:  # every second slice lies 0.3 of a step late
         heights = (
             scan.affine[:3, 3] + (np.arange(22)[:, None] + 0.3 * (np.arange(22) % 2)[:, None]) * scan.affine[:3, 2]
         )

@@ -44,7 +44,7 @@ def test_shown_meshes_are_saved_to_each_mesh_format(open_session, tmp_path, name
 
 
 @pytest.mark.opencl
-def test_mesh_after_a_hidden_scan_is_saved_alone(open_session):
+def test_mesh_beside_a_hidden_scan_is_all_that_is_shown(open_session):
     view = open_session(scenes.make_scan(), scenes.make_mesh())
     _, mesh = view.painter.mesh_of_shown(view.model.state)
     view.do({"do": "show", "key": "1", "visible": False})

@@ -56,7 +56,7 @@ def test_zoom_of_the_camera_ends_at_a_hundredth_of_a_mm():
 
 @pytest.mark.parametrize("factor", [0.0, -1.0, float("nan"), float("inf")])
 def test_zoom_of_the_camera_by_no_factor_above_0_is_refused(factor):
-    with refused(UsageError, 0):
+    with refused(UsageError, "factor", "above"):
         zoom_camera(PARALLEL, factor)
 
 

@@ -8,6 +8,7 @@ import view_scenes as scenes
 from view_models import make_model
 
 from clrecon.geometry import Volume
+from clrecon.rendering.views.directions import LEAST_COSINE
 
 pytestmark = pytest.mark.unit
 
@@ -121,7 +122,7 @@ def test_mode_slices_turns_a_camera_that_sees_them_edge_on():
 
     normal = np.cross(*model.scans[0].volume.affine[:3, :2].T)
     cosine = model.camera.basis().forward @ normal / np.linalg.norm(normal)
-    assert abs(cosine) >= 0.25  # a quarter of their height is seen, the least of `clrecon.render`
+    assert abs(cosine) >= LEAST_COSINE  # a quarter of their height is seen, as at least in `clrecon.render`
     assert model.facts()["notes"] == []
 
 

@@ -370,7 +370,7 @@ def test_perspective_camera_shows_the_focal_plane_as_large_as_the_parallel_one()
     model.set_perspective(on=True)
 
     perspective = model.state.camera
-    assert perspective.view_angle == 30.0
+    assert perspective.view_angle == 30.0  # degrees, of each view
     assert perspective.focal_point == parallel.focal_point
     assert perspective.half_height() * perspective.distance == pytest.approx(parallel.parallel_scale)
 

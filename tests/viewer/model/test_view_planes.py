@@ -92,7 +92,9 @@ def test_straightened_slices_lie_along_the_axes_of_the_patient() -> None:
 
     model.straighten()
 
-    assert "number" in model.facts()["slices"]["coronal"]
+    looks = [find_forward(plane, model.state.turn).tolist() for plane in ("axial", "coronal", "sagittal")]
+    assert looks == [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]
+    assert "number" in model.facts()["slices"]["coronal"]  # in place of its angle
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ pytestmark = pytest.mark.unit
 SECRET = "a-SECRET_of-43-characters-as-they-are-made-0"
 
 
-def test_secret_is_long_and_never_the_same() -> None:
+def test_hundred_secrets_are_long_and_all_different() -> None:
     made = {make_secret() for _ in range(100)}
     assert len(made) == 100
     assert min(map(len, made)) >= 43  # 256 bits, 6 a letter

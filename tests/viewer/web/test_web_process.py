@@ -22,6 +22,7 @@ from variants import daily
 from web_views import browsing
 
 from clrecon.cli.main import main
+from clrecon.errors import NoDicomError
 from clrecon.reading.grids.write_volume import write_volume
 from clrecon.viewer.web.server import bind_port
 
@@ -145,8 +146,8 @@ def test_port_that_is_taken_is_said_before_anything_is_read(printed: Printer) ->
     printed().assert_error(port, "--port")
 
 
-def test_input_that_is_not_there_is_named_with_an_exit_code_of_input(printed: Printer) -> None:
-    assert main(["view", "no_such_folder"]) in (2, 3)  # refused input or usage
+def test_input_that_is_not_there_is_named_with_the_exit_code_of_no_input(printed: Printer) -> None:
+    assert main(["view", "no_such_folder"]) == NoDicomError.exit_code
     printed().assert_error("no_such_folder")
 
 

@@ -267,7 +267,7 @@ def test_command_after_a_wrong_message_is_obeyed(served: WebServer, message: obj
             await client.socket.send_str(json.dumps(message))
             await client.until(lambda: client.notes)
             await client.tell(do="set_iso", hu=210)
-            await client.until(lambda: client.facts and client.facts["iso"]["hu"] != 200.0)
+            await client.until(lambda: client.facts and client.facts["iso"]["hu"] != ISO_AT_FIRST)
             return client.facts["iso"]["hu"]
 
     assert asyncio.run(browse()) == 210
@@ -565,7 +565,7 @@ def test_browsers_go_on_when_one_beyond_the_most_is_turned_away(served: WebServe
             async with browsing(served) as one_more:
                 await one_more.until(lambda: one_more.close_code is not None)
             await browsers[-1].tell(do="set_iso", hu=230)
-            await browsers[-1].until(lambda: browsers[-1].facts["iso"]["hu"] != 200.0)
+            await browsers[-1].until(lambda: browsers[-1].facts["iso"]["hu"] != ISO_AT_FIRST)
             return browsers[-1].facts["iso"]["hu"]
 
     assert asyncio.run(browse()) == 230
