@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import is_set
 from refusals import refused
 from variants import daily
 
@@ -94,10 +93,6 @@ class Buffers:
         return sum(buffer() is not None for buffer in self._made)
 
 
-def last_of_each_stage(found: Calls) -> Calls:
-    return list({moment[0]: moment for moment in found}.values())
-
-
 def old_files(folder: Path, *names: str) -> dict[str, bytes]:
     for name in names:
         (folder / name).write_bytes(b"old " + name.encode())
@@ -117,7 +112,7 @@ def files_in(folder: Path) -> dict[str, bytes]:
         ),
     ],
 )
-def test_reading_cancelled_at_any_progress_ends_its_threads(read: Callable[..., object], scan: Path) -> None:
+def test_reading_cancelled_in_any_stage_ends_its_threads(read: Callable[..., object], scan: Path) -> None:
     calls = pick_calls(lambda progress: clrecon.read_volume(scan, progress=progress))
     assert {stage for stage, _, _ in calls} == {"scan", "read"}
     before = threading.enumerate()
@@ -133,7 +128,7 @@ def test_reading_cancelled_at_any_progress_ends_its_threads(read: Callable[..., 
 
 @pytest.mark.release
 @pytest.mark.slow
-def test_mesh_job_cancelled_at_any_progress_leaves_older_files(scan: Path, device: Any, tmp_path: Path) -> None:
+def test_mesh_job_cancelled_in_any_stage_leaves_older_files(scan: Path, device: Any, tmp_path: Path) -> None:
     settings = MeshSettings(
         iso_value=(100.0, 200.0), smooth=2, decimate=0.5, split=True, field_of_view=14.0, device=str(device.index)
     )
@@ -149,7 +144,7 @@ def test_mesh_job_cancelled_at_any_progress_leaves_older_files(scan: Path, devic
     }  # fmt: skip
     assert ("write", 1, 2) in found  # between the files
     before = old_files(tmp_path, "a.stl", "a_100hu_001.stl", "a.json")
-    for moment in found if is_set("CLRECON_RELEASE_TESTS") else last_of_each_stage(found):
+    for moment in found:
         cancel_at(work, moment)
         assert files_in(tmp_path) == before
 
@@ -175,7 +170,7 @@ def pick_calls_of_surface(volume: Volume, device: Any) -> Calls:
     return calls
 
 
-def test_surface_in_slabs_cancelled_at_any_progress_holds_no_buffers(
+def test_surface_in_slabs_cancelled_in_any_stage_holds_no_buffers(
     block: Volume, device: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls = pick_calls_of_surface(block, device)
@@ -269,7 +264,7 @@ def test_cancelled_surfaces_of_labels_hold_no_buffers(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", daily(1, ["a.apng", "a.gif", "a.mp4", "frames"]))
-def test_turntable_cancelled_at_any_progress_leaves_older_files_and_holds_no_buffers(
+def test_turntable_cancelled_in_any_stage_leaves_older_files_and_holds_no_buffers(
     name: str, scan: Path, device: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settings = RenderSettings.of(

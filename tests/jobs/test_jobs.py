@@ -155,6 +155,8 @@ def test_demo_writes_a_closed_manifold_mesh_of_its_report(demo: tuple[Path, dict
     report = json.loads((folder / "report.json").read_text())
 
     assert (report["closed"], report["manifold"]) == (True, True)
+    stl_bytes = 84 + 50 * report["triangles"]  # of a binary STL: its header, and each triangle
+    assert (folder / "bone.stl").stat().st_size == stl_bytes
     assert report["triangles"] == made["mesh"]["triangles"] > 100_000  # a lumbar spine in voxels of 1 x 1 x 1.25 mm
 
 

@@ -55,6 +55,8 @@ def test_mesh_without_the_table_is_that_of_the_bone_alone(
 ) -> None:
     report = mesh_with(scan, tmp_path, device, *options)
     assert (report["components"], report["closed"]) == (1, True)
+    (left, *_), (right, *_) = report["bounds_mm"]
+    assert right - left == pytest.approx(24.0, abs=2 * 2.0)  # mm, and a pixel at either end: the table is 116 mm wide
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from odd_bodies import BODIES, OddBodies, OddBody
 from refusals import refused
 from variants import but_seldom, daily, daily_rows
 
+from clrecon.anatomy.dense_pieces import BONE_KEPT
 from clrecon.cli.mesh import describe_purposes
 from clrecon.errors import ClreconError, NoSurfaceError, RefusedInputError
 from clrecon.jobs.mesh.job import make_mesh
@@ -23,8 +24,6 @@ from clrecon.system.text import count_of, format_ml
 BONY = [name for name in BODIES if name not in ("water", "empty")]
 SELDOM = ("skull-prone", "head", "pair", "contrast")
 """Bodies whose tables or shapes others have too: the longest test of each is for a release."""
-BONE_KEPT = 0.98
-"""The least share of bone that the gate `bone_kept` passes."""
 SPINELESS = [name for name in BODIES if name != "contrast"]
 
 
@@ -191,8 +190,9 @@ def test_seed_in_bone_keeps_one_component_of_bone_about_it(
     odd: OddBodies, device: Any, tmp_path: Path, name: str
 ) -> None:
     body = odd[name]
-    dense = np.argwhere(body.of("bone") & (body.volume.voxels > 500))
-    seed = body.volume.ijk_to_lps(dense[len(dense) // 2][None, ::-1])[0]
+    dense_kji = np.argwhere(body.of("bone") & (body.volume.voxels > 500))
+    some_ijk = dense_kji[len(dense_kji) // 2][::-1]
+    seed = body.volume.ijk_to_lps([some_ijk])[0]
     report, vertices = mesh_of(odd, device, tmp_path, name, iso_value=300.0, seeds=[tuple(seed)])
     assert report["components_kept"] == 1
     nearest = np.linalg.norm(body.volume.ijk_to_lps(vertices) - seed, axis=1).min()
@@ -339,7 +339,7 @@ def test_surface_below_a_level_of_a_table_alone_is_refused_as_without_a_body(
         pytest.param("pelvis", (2500.0, 3071.0), ("metal",), False, id="metal of 3071 HU, the highest"),
     ],
 )
-def test_surface_of_a_range_of_hu_lies_on_the_material_with_these_values_at_both_ends_of_the_range(
+def test_surface_of_a_range_of_hu_lies_on_its_material_at_the_lower_end_and_where_that_exceeds_it_at_the_upper(
     odd: OddBodies, device: Any, tmp_path: Path, name: str, band: tuple[float, float], materials: tuple[str, ...],
     is_exceeded: bool,
 ) -> None:  # fmt: skip

@@ -181,7 +181,7 @@ def test_settings_that_choose_components_are_told_from_those_that_keep_all(
 
 @pytest.mark.parametrize("radius", [None, 4.0])
 def test_corridor_with_a_radius_has_the_diameter_of_a_screw_and_one_without_has_none(radius: float | None) -> None:
-    names = (
+    names = (  # all that is described of a corridor; here only the radius is known
         *("side", "refused", "length", "medial_deg", "sagittal_deg", "medial_range_deg", "sagittal_range_deg", "tried"),
         *("medial_lps_deg", "sagittal_lps_deg", "entry", "tip", "back", "pass_point", "margins", "canal", "bias"),
         *("by_hu_share", "width_voxels"),

@@ -13,9 +13,12 @@ from refusals import refused
 
 from clrecon.cli.main import main
 from clrecon.errors import ClreconError, OutputError, UsageError
+from clrecon.jobs.cloud.job import CloudFiles, make_cloud
+from clrecon.jobs.export import export_volume
 from clrecon.jobs.mesh.job import make_mesh
 from clrecon.jobs.render.job import PictureFiles, make_pictures
 from clrecon.jobs.render.settings import RenderSettings, Turntable
+from clrecon.jobs.vertebrae import make_vertebrae
 from clrecon.proof.bench import run_bench
 from clrecon.system.files import replace_file
 
@@ -64,13 +67,20 @@ OUTPUTS: dict[str, tuple[str, Callable[[str], object]]] = {
             "ct", PictureFiles(turntable=path), RenderSettings.of(turntable=Turntable(frames=2))
         ),
     ),
+    "cloud": (".ply", lambda path: make_cloud("ct", CloudFiles(path))),
+    "removed points": (".ply", lambda path: make_cloud("ct", CloudFiles("a.ply", removed=path))),
+    "surface of a cloud": (".stl", lambda path: make_cloud("ct", CloudFiles("a.ply", surface=path))),
+    "report of a cloud": (".json", lambda path: make_cloud("ct", CloudFiles("a.ply", report=path))),
+    "volume": (".nrrd", lambda path: export_volume("ct", path)),
+    "report of a volume": (".json", lambda path: export_volume("ct", "a.nrrd", report_path=path)),
+    "map of vertebrae": (".nii.gz", lambda path: make_vertebrae("ct", path)),
 }
-"""Each output of each job: its extension, and a job that writes it to a path."""
+"""Outputs of jobs that need a scan alone: their extension, and a job that writes to a path."""
 
 
 @pytest.mark.parametrize("link", ["link", "link to a link", "hard link"])
 @pytest.mark.parametrize(("extension", "run_job"), OUTPUTS.values(), ids=OUTPUTS)
-def test_output_of_any_job_over_a_slice_by_a_link_is_refused(scan, link, extension, run_job):
+def test_output_of_a_job_over_a_slice_by_a_link_is_refused(scan, link, extension, run_job):
     path = make_path_to(link, scan / "IM0001", f"out{extension}")
     with pytest.raises(OutputError, match=DICOM_THERE):
         run_job(path)

@@ -61,7 +61,7 @@ def test_job_on_a_named_device_that_fails_is_refused_with_the_number_of_the_cpu_
 ):
     name, options = COMMANDS[command]
     write_series(tmp_path / "ct")
-    Failing(monkeypatch, "launch", first=3, last=NEVER, label=gpu.label)
+    Failing(monkeypatch, "launch", first=3, last=NEVER, label=gpu.label)  # the third launch and all later ones
     output: Path = tmp_path / name
     assert main([command, str(tmp_path / "ct"), "-o", str(output), *options, "--device", "gpu"]) == 5
     printed().assert_error("--device", device.index)

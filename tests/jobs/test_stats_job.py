@@ -57,8 +57,11 @@ def test_report_of_stats_has_volume_mean_and_percentiles_of_each_label(
     assert (named["number"], named["voxels"], unnamed["name"]) == (2, 32, "label_5")
     assert named["ml"] == pytest.approx(32 * 0.01)
     assert named["mean_hu"] == pytest.approx((24 * 100 + 8 * 107) / 32)
+    assert unnamed["ml"] == pytest.approx(64 * 0.01)
+    assert unnamed["mean_hu"] == pytest.approx((16 * 7 + 48 * 0) / 64)
     assert report["percentiles"] == [2.5, 50.0]
     assert named["percentiles_hu"] == {"2.5": 100.0, "50": 100.0}
+    assert unnamed["percentiles_hu"] == {"2.5": 0.0, "50": 0.0}
 
 
 def test_report_of_stats_has_the_peak_of_memory_and_whether_labels_were_resampled(

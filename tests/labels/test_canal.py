@@ -8,7 +8,7 @@ import tolerances
 from variants import daily
 
 from clrecon.geometry import Volume
-from clrecon.labels.canal import _Places, find_canal
+from clrecon.labels.canal import LEAST_HOLE_MM2, SPREAD_MM, _Places, find_canal
 
 BODY, PEDICLES, LAMINA = (0, 30), (8, 22), (8, 14)
 """Heights in mm of the parts of a block; the canal is 20 mm wide and 16 mm deep between them."""
@@ -124,13 +124,15 @@ def test_closed_chamber_behind_the_canal_is_not_taken_for_it():
 
 
 def test_hole_of_25_mm2_behind_the_body_is_no_canal():
+    assert LEAST_HOLE_MM2 > 25
     solid, volume, _ = make_block(pedicles=(8, 8))
     solid[18:24, 30:60, 30:60] = True
-    solid[18:24, 50:55, 40:45] = False
+    solid[18:24, 50:55, 40:45] = False  # 5 x 5 voxels of 1 mm
     assert find_canal(solid, volume) is None
 
 
 def test_gap_of_a_pedicle_beside_the_canal_counts_for_its_first_4_mm_alone():
+    assert SPREAD_MM == 4.0
     solid, volume, expected = make_block()
     gap = np.zeros_like(solid)
     gap[27:31, 40:44, 45:52] = True  # 7 mm into a pedicle from the canal, in slices where the arch is open behind

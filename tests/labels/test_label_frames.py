@@ -9,7 +9,7 @@ from pydicom import Dataset
 from refusals import refused
 
 from clrecon.errors import RefusedInputError
-from clrecon.labels.segmentation import place_frames
+from clrecon.labels.segmentation import MOST_SLICES, place_frames
 
 SQUARE = (1, 0, 0, 0, 1, 0)
 
@@ -114,14 +114,19 @@ def test_frames_micrometres_apart_and_uneven_are_refused():
         place_frames(groups_of_all_frames(), frames, "a.dcm")
 
 
-def test_stack_of_100_001_slices_is_placed():
-    frames = groups_of_frames_at(0.0, 0.5, 50_000.0)  # mm
-    assert place_frames(groups_of_all_frames(), frames, "a.dcm").slices == 100_001
+LONGEST_MM = 0.5 * MOST_SLICES
+"""Height of the last slice of the longest stack, in steps of 0.5 mm; the first lies at 0."""
 
 
-def test_stack_of_100_002_slices_is_refused():
-    with refused(RefusedInputError, "a.dcm", 0.5, 50000.5):  # the step and the length, mm
-        place_frames(groups_of_all_frames(), groups_of_frames_at(0.0, 0.5, 50_000.5), "a.dcm")
+def test_stack_of_the_most_steps_is_placed():
+    frames = groups_of_frames_at(0.0, 0.5, LONGEST_MM)
+    assert place_frames(groups_of_all_frames(), frames, "a.dcm").slices == 1 + MOST_SLICES
+
+
+def test_stack_of_a_step_more_is_refused():
+    frames = groups_of_frames_at(0.0, 0.5, LONGEST_MM + 0.5)
+    with refused(RefusedInputError, "a.dcm", 0.5, LONGEST_MM + 0.5):  # the step and the length, mm
+        place_frames(groups_of_all_frames(), frames, "a.dcm")
 
 
 def frames_of_which_the_second_has(element, values):
@@ -157,7 +162,8 @@ DIRECTIONS = {
     "of length 1, not at a right angle": (1, 0, 0, 0.08, 0.996795, 0),
     "both too short": (0.999, 0, 0, 0, 0.9985, 0),
 }
-"""Row and column directions beside (1, 0, 0) and (0, 1, 0)."""
+"""Row and column directions beside (1, 0, 0) and (0, 1, 0): a length, or that of the normal, is off 1 by 0.002 to
+0.0032, where 0.001 is allowed."""
 
 
 @pytest.mark.parametrize("directions", DIRECTIONS.values(), ids=DIRECTIONS)

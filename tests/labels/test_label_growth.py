@@ -116,7 +116,8 @@ def test_grown_samples_get_the_nearest_label_in_mm_and_the_lowest_of_equally_nea
     k, j, i = np.nonzero(labels)
     labelled_points, numbers = volume.ijk_to_lps(np.stack([i, j, k], axis=1)), labels[k, j, i]
     for at in np.ndindex(labels.shape):
-        distances = np.linalg.norm(labelled_points - volume.ijk_to_lps([at[::-1]])[0], axis=1)
+        point = volume.ijk_to_lps([at[::-1]])[0]  # of k, j, i
+        distances = np.linalg.norm(labelled_points - point, axis=1)
         equally_near = distances <= distances.min() + tolerances.EQUAL_DISTANCE_MM
         nearest = numbers[equally_near].min() if distances.min() <= grow_mm else 0
         assert grown[at] == (labels[at] or nearest)

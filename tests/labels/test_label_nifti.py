@@ -32,9 +32,13 @@ def overwrite_field(path, field, *values):
     return path
 
 
+WHOLE_NUMBERS = [*("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64")]
+"""The types of NIfTI but complex ones, colours, and numbers of 128 bits."""
+
+
 @pytest.mark.parametrize("kind", ["Nifti1Image", "Nifti2Image"])
 @pytest.mark.parametrize("name", ["a.nii", "a.nii.gz"])
-@pytest.mark.parametrize("dtype", ["uint8", "int16", "uint16", "int32", "int64", "float32", "float64"])
+@pytest.mark.parametrize("dtype", WHOLE_NUMBERS)
 def test_nifti_of_whole_numbers_of_every_type_is_read_with_its_voxels_and_place(tmp_path, kind, name, dtype):
     voxels = make_labels()
     labels = read_labels(write_nifti(tmp_path / name, voxels, OBLIQUE, dtype=dtype, kind=kind))

@@ -45,7 +45,7 @@ def test_nrrd_of_every_anatomical_frame_is_read_with_its_place_in_lps(tmp_path, 
     assert np.allclose(labels.affine, OBLIQUE, atol=tolerances.DECIMAL_PLACE_MM)
 
 
-@pytest.mark.parametrize("dtype", ["<i1", "<u1", "<u2", ">i2", "<i4", "<i8", "<f4", ">f8"])
+@pytest.mark.parametrize("dtype", ["<i1", "<u1", "<u2", ">i2", "<i4", "<u4", "<i8", "<u8", "<f4", ">f8"])
 def test_nrrd_of_whole_numbers_of_every_type_is_read(tmp_path, dtype):
     voxels = make_labels()
     assert np.array_equal(read_labels(write_nrrd(tmp_path / "a.nrrd", voxels.astype(dtype))).voxels, voxels)

@@ -102,7 +102,7 @@ def test_small_map_is_not_large_by_default_but_where_100_bytes_are_many(tmp_path
 
 
 def test_map_that_is_missing_is_not_called_large(tmp_path: Path) -> None:
-    assert not is_large_map(tmp_path / "missing")
+    assert not is_large_map(tmp_path / "missing", most_bytes=0)
 
 
 def test_large_map_of_8_times_the_voxels_of_its_scan_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -69,9 +69,10 @@ def test_map_on_an_oblique_and_coarser_grid_gives_the_label_of_the_nearest_voxel
     assert not resampled.exact
     for k, j, i in np.ndindex(VOXELS.shape):
         place = np.linalg.solve(affine, [*VOLUME.ijk_to_lps([(i, j, k)])[0], 1.0])[:3]
-        nearest = np.rint(place).astype(int)
-        is_inside = (nearest >= 0).all() and (nearest < labels.shape_ijk).all()
-        assert resampled.voxels[k, j, i] == (labels.voxels[tuple(nearest[::-1])] if is_inside else 0)
+        nearest_ijk = np.rint(place).astype(int)
+        is_inside = (nearest_ijk >= 0).all() and (nearest_ijk < labels.shape_ijk).all()
+        nearest_kji = tuple(nearest_ijk[::-1])
+        assert resampled.voxels[k, j, i] == (labels.voxels[nearest_kji] if is_inside else 0)
 
 
 def test_slices_with_uneven_gaps_get_the_labels_at_their_own_positions():

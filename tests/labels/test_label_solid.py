@@ -20,6 +20,7 @@ def test_box_of_a_label_reaches_its_margin_and_a_sample_further_and_ends_with_th
     labels[0, 29, 39] = 4  # in a corner of the grid
     margins_ijk = (1, 2, 3)
     boxes = find_boxes(labels, (2, 3, 4), margins_ijk)  # no voxel has label 3
+    # Along k, j and i the margins of 3, 2 and 1 samples and one more, on either side.
     assert boxes == {2: box_of((6, 16), (11, 20), (18, 23)), 4: box_of((0, 5), (26, 30), (37, 40))}
 
 

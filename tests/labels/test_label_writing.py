@@ -43,9 +43,11 @@ def read_slices(scan):
 @pytest.fixture(params=PLANS)
 def scan(request, tmp_path):
     """A folder with a CT series."""
-    dicom_series.write_series(
-        tmp_path / "ct", PLANS[request.param], lambda ds, k: setattr(ds, "StudyInstanceUID", "1.2.7")
-    )
+
+    def add_study(ds, k):
+        ds.StudyInstanceUID, ds.StudyDate, ds.PatientBirthDate, ds.AccessionNumber = "1.2.7", "20190304", "1950", "A"
+
+    dicom_series.write_series(tmp_path / "ct", PLANS[request.param], add_study)
     return tmp_path / "ct"
 
 
@@ -141,7 +143,9 @@ def test_each_frame_of_a_written_segmentation_lies_on_the_slice_that_it_referenc
 def test_written_segmentation_has_no_name_nor_date_of_the_patient(scan, tmp_path):
     labels = make_labels_on(read_volume(scan))
     segmentation = pydicom.dcmread(write_segmentation(tmp_path / "a.dcm", labels, scan))
+    first = read_slices(scan)[0]
     for keyword in ("PatientName", "PatientID", "PatientBirthDate", "StudyDate", "AccessionNumber"):
+        assert str(first[keyword].value) != ""
         assert str(segmentation[keyword].value or "") == ""
 
 

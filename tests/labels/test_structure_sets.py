@@ -448,7 +448,8 @@ def test_command_stats_measures_the_rois_of_a_structure_set(scan_with_structure_
     assert main(["stats", scan, "--report", str(tmp_path / "s.json"), "--labels", path, "-q"]) == 0
     (label,) = json.loads((tmp_path / "s.json").read_text())["labels"]
     assert label["name"] == "L3"
-    voxel_mm3 = 0.7 * 0.5 * 1.25
+    plan = PLANS["straight"]
+    voxel_mm3 = np.prod(plan.pixel_spacing) * plan.gap
     assert label["ml"] == pytest.approx(3 * 9 * 7 * voxel_mm3 / 1000)
 
 

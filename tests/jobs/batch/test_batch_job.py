@@ -100,7 +100,9 @@ def test_row_of_a_case_in_the_table_has_the_figures_of_its_report(cohort: Path) 
     assert float(row["volume_ml"]) == pytest.approx(report["mesh"]["volume_ml"], abs=1e-6)  # six decimals
 
 
-def test_case_with_a_cloud_and_two_views_and_no_mesh_has_just_these_files(cohort: Path, tmp_path: Path) -> None:
+def test_case_with_cloud_and_two_views_without_a_mesh_has_these_files_and_the_cloud_of_the_command(
+    cohort: Path, tmp_path: Path
+) -> None:
     (tmp_path / "m.csv").write_text(f"case,input\nA,{cohort / 'ball1'}\n")
     options = ["--cloud", "ply", "--no-mesh", "--view", "left,anterior"]
 
@@ -144,6 +146,7 @@ def test_part_of_a_batch_writes_its_cases_and_no_table(tmp_path: Path) -> None:
 
     assert batch.run("--part", "1/2", "--no-picture", "-q") == 8
 
+    # Of A, B, gone and C the first and the third.
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["A", "gone"]
 
 
@@ -182,7 +185,8 @@ def test_resume_with_another_setting_makes_all_cases(whole_batch: Batch, printed
 
     assert whole_batch.run("--resume", "--json", hu="250") == 8
 
-    assert printed().report()["kept"] == 0
+    report = printed().report()
+    assert (report["made"], report["kept"]) == (4, 0)
 
 
 @pytest.mark.seconds
@@ -216,7 +220,7 @@ def test_collect_lists_a_case_that_was_not_made_as_missing_and_makes_none(whole_
 def test_existing_cases_stay_with_no_clobber(cohort: Path, printed: Any) -> None:
     before = files_of(cohort / "out")
     assert main(["batch", str(cohort / "m.csv"), "-o", str(cohort / "out"), "--no-clobber"]) == 6
-    printed().assert_error(4, "A")
+    printed().assert_error(4, "A")  # cases that exist, and the first of them
     assert files_of(cohort / "out") == before
 
 
@@ -259,6 +263,7 @@ def test_statistics_of_labels_are_in_the_report_of_the_case_and_the_table_of_the
 
 
 def test_case_that_fails_a_strict_gate_has_status_gate_and_keeps_its_mesh(tmp_path: Path) -> None:
+    # A slice is missing, which --allow-gaps reads and a gate of the scan marks.
     write_phantom(tmp_path / "ct", PhantomSettings(kind="sphere", size=(24, 24), slices=16, noise=0.0, missing=(7,)))
     (tmp_path / "m.csv").write_text("case,input\na,ct\n")
     command = ["batch", str(tmp_path / "m.csv"), "-o", str(tmp_path / "out"), "--hu", "300", "--allow-gaps", "-q"]

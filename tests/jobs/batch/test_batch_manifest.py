@@ -103,7 +103,7 @@ def test_manifest_in_parquet_without_pyarrow_is_refused_with_its_name(
         read_cases(tmp_path / "cohort.parquet", ScanSettings())
 
 
-def test_all_devices_are_those_of_the_machine_that_are_no_simulators() -> None:
+def test_all_devices_are_those_without_simulators_and_shortcomings_one_for_each_worker() -> None:
     usable = [str(own.index) for own in list_devices() if not (own.is_simulator or own.shortcoming)]
     assert BatchSettings(devices="all").deal_devices() == usable
     assert BatchSettings(devices="all", workers=1).deal_devices() == usable[:1]

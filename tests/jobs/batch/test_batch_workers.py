@@ -88,7 +88,7 @@ def test_case_of_a_killed_worker_is_lost_alone_and_named_with_the_signal_and_res
     assert (resumed["made"], resumed["kept"]) == (1, len(small_cases) - 1)
 
 
-def test_case_of_a_killed_worker_among_several_is_made_again_alone(tmp_path: Path) -> None:
+def test_cases_of_two_killed_workers_are_made_again(tmp_path: Path) -> None:
     write_ball(tmp_path / "small", size=24)
     cases = ("first", "second", "third")
     write_manifest(tmp_path, dict.fromkeys(cases, "small"))

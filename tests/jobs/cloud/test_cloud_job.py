@@ -16,7 +16,7 @@ from refusals import refused
 import clrecon
 from clrecon.errors import UsageError
 from clrecon.jobs.cloud.job import CloudFiles, make_cloud
-from clrecon.jobs.cloud.settings import STEPS, CloudSettings
+from clrecon.jobs.cloud.settings import CloudSettings
 from clrecon.jobs.presets import DEFAULT_PRESET, PRESETS
 
 pytestmark = pytest.mark.first_device
@@ -62,6 +62,7 @@ def test_report_of_a_surface_cloud_describes_the_points_in_its_file(surface_fold
 
 def test_report_of_a_cloud_names_its_only_output(surface_folder: Path) -> None:
     (output,) = json.loads((surface_folder / "r.json").read_text())["outputs"]
+    assert (output["what"], output["format"]) == ("cloud", "npz")
     assert output["bytes"] == (surface_folder / "out.npz").stat().st_size
     assert {path.name for path in surface_folder.iterdir()} == {"out.npz", "r.json"}
 
@@ -116,8 +117,13 @@ def test_report_of_clusters_counts_what_was_removed_and_why(clustered_folder: Pa
 
 def test_clusters_are_reported_before_the_rules_that_keep_them_whatever_their_order(clustered_folder: Path) -> None:
     report = json.loads((clustered_folder / "r.json").read_text())
+    first_rule, cluster = CLUSTERED.index("--keep"), CLUSTERED.index("--cluster")
+    assert first_rule < cluster  # in the command
     assert [step["step"] for step in report["steps"]] == ["points", "clusters", "keep"]
-    assert list(STEPS).index("clusters") < list(STEPS).index("keep")
+
+
+def test_report_of_clusters_lists_the_cloud_and_the_removed_points(clustered_folder: Path) -> None:
+    report = json.loads((clustered_folder / "r.json").read_text())
     assert [output["what"] for output in report["outputs"]] == ["cloud", "removed"]
 
 
@@ -229,7 +235,7 @@ def test_seed_in_the_frame_of_the_output_keeps_the_cluster_at_it(
     ids=["surface", "shell", "voxels"],
 )
 @pytest.mark.parametrize("extension", ["ply", "vtp", "npz", "xyz"])
-def test_each_kind_of_points_is_written_to_each_format(
+def test_points_of_a_surface_a_shell_and_voxels_are_written_to_ply_vtp_npz_and_xyz(
     kind: str, taken: str, extension: str, scan: Path, tmp_path: Path, cloud_command: Any,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from refusals import refused
 
+from clrecon.anatomy.iso_choice import CONTRAST_SAID
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.jobs.mesh.job import make_mesh
@@ -20,8 +21,6 @@ AFFINE = np.diag((1.0, 1.0, 1.5, 1.0))
 HEART_RADIUS_MM, BONE_RADIUS_MM = 12, 9
 HEART_HU, BONE_HU = 380.0, 900.0
 HEART_ML, BONE_ML = 4 / 3 * np.pi * HEART_RADIUS_MM**3 / 1000, 4 / 3 * np.pi * BONE_RADIUS_MM**3 / 1000
-FLAT_SHARE = 0.05
-"""Of the contrast: where more of it ends in flat plateaus a scan is taken to have contrast medium."""
 
 
 def make_scan(*, heart: float = HEART_HU, bone: float = BONE_HU) -> Volume:
@@ -88,7 +87,7 @@ def test_auto_warns_of_contrast_medium_and_states_its_share(set_scan: Any, devic
     report = mesh_scan(tmp_path, device, half_way="auto")
 
     share = report["iso_value_choice"]["flat_share"]
-    assert share > FLAT_SHARE
+    assert share > CONTRAST_SAID  # of the contrast, from which on a scan is taken to have contrast medium
     assert f"{100 * share:.0f} % of the contrast ends in flat plateaus" in report["iso_value_reason"]
     assert len(warnings_with("as heart, vessels and organs with contrast medium do", report)) == 1
 
@@ -98,7 +97,7 @@ def test_auto_has_no_warning_in_a_scan_without_contrast_medium(set_scan: Any, de
 
     report = mesh_scan(tmp_path, device, half_way="auto")
 
-    assert report["iso_value_choice"]["flat_share"] < FLAT_SHARE
+    assert report["iso_value_choice"]["flat_share"] < CONTRAST_SAID
     assert "flat" not in report["iso_value_reason"]
     assert report["warnings"] == []
 

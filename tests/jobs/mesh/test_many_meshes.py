@@ -171,7 +171,8 @@ def test_limits_and_split_are_applied_to_each_iso_value(device: Any, tmp_path: P
 def test_seed_in_the_frame_of_the_mesh_keeps_the_component_about_it(
     space: str, sign: float, device: Any, tmp_path: Path
 ) -> None:
-    middle_box_lps = AFFINE[:3, :3].diagonal() * (20.5, 16.0, 3.5) + AFFINE[:3, 3]
+    middle_ijk = (20.5, 16.0, 3.5)  # of the voxels 18 to 23, 15 to 17 and 2 to 5 of the middle box
+    middle_box_lps = AFFINE[:3, :3].diagonal() * middle_ijk + AFFINE[:3, 3]
     seed = (middle_box_lps * [sign, sign, 1]).tolist()
 
     report = mesh_boxes(tmp_path, device, iso_value=(200.0, 500.0), seeds=[seed], space=space)

@@ -68,6 +68,7 @@ def test_mesh_in_another_frame_is_stored_in_that_of_the_scan(archive: Archive, s
 @pytest.mark.parametrize(
     ("answers", "code"),
     [
+        # FailedSOPSequence, with the FailureReason of its only item
         ([answering(b"[]"), answering(b'{"00081198": {"Value": [{"00081197": {"Value": [272]}}]}}', status=409)], 6),
         ([answering(b"[]"), answering(b"<html>")], 6),
         ([answering(status=401)], 3),
@@ -88,7 +89,7 @@ def test_mesh_that_is_not_stored_is_not_written_either(
 
 
 @pytest.mark.parametrize(
-    "reply",
+    "reply",  # 00081199: ReferencedSOPSequence, what was stored; 00081198: FailedSOPSequence; 00081197: FailureReason
     [
         "[]",
         "{",

@@ -123,7 +123,7 @@ def test_white_cloud_has_shades_of_grey_only_with_a_light(
         (["--values", "v.npy"], "--values does not apply to mode points"),
     ],
 )
-def test_option_without_meaning_for_a_cloud_is_refused_and_no_picture_is_written(
+def test_wrong_option_for_a_picture_of_a_cloud_is_refused_and_no_picture_is_written(
     option: list[str], says: str, device: Any, cloud_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip

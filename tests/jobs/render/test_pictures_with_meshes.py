@@ -236,13 +236,13 @@ def test_turntable_of_a_mesh_writes_the_given_number_of_frames(
         pytest.param(["scan.nii", "--opacity", "0.5"], "--opacity does not apply to mode dvr", id="opacity of a scan"),
     ],
 )
-def test_options_without_meaning_for_meshes_are_refused_in_one_line(
+def test_wrong_options_for_a_picture_with_meshes_are_refused_in_one_line(
     words: list[str], text: str, files: dict[str, Path], monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     monkeypatch.chdir(files["scan.nii"].parent)
 
-    assert main(["render", *words, "-o", "out.png"]) != 0
+    assert main(["render", *words, "-o", "out.png"]) == 3
 
     (line,) = capsys.readouterr().err.splitlines()
     assert text in line

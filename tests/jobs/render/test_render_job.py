@@ -61,7 +61,7 @@ def views_of_sphere(device: Any, sphere: Path, tmp_path_factory: Any) -> tuple[P
     return folder, make_pictures(sphere, files, settings)
 
 
-def test_sphere_is_a_disc_of_its_area_from_every_side(views_of_sphere: tuple[Path, Any], true_surface: Any) -> None:
+def test_sphere_is_a_disc_of_its_area_from_three_sides(views_of_sphere: tuple[Path, Any], true_surface: Any) -> None:
     folder, report = views_of_sphere
     radius_mm = true_surface["radius_mm"]
 
@@ -73,7 +73,7 @@ def test_sphere_is_a_disc_of_its_area_from_every_side(views_of_sphere: tuple[Pat
     assert areas == [pytest.approx(np.pi * radius_mm**2, rel=0.08)] * 3  # pixels of a tenth of the radius
 
 
-def test_least_depth_of_a_sphere_is_that_of_its_nearest_point_from_every_side(
+def test_least_depth_of_a_sphere_is_that_of_its_nearest_point_from_three_sides(
     views_of_sphere: tuple[Path, Any], true_surface: Any
 ) -> None:
     folder, report = views_of_sphere

@@ -1,4 +1,4 @@
-"""Gates: each fault fails its own gate and no other."""
+"""Gates: which of them a fault fails, and what they say."""
 
 from __future__ import annotations
 
