@@ -145,7 +145,7 @@ def test_report_of_a_removed_table_keeps_other_entries_and_the_given_report_stay
 
 
 def test_removed_voxels_become_the_level_of_the_air_of_the_scan():
-    """No iso value shows where the mask ends, but those in the noise of the air itself."""
+    """With the -1000 HU of other scans, the end of the mask would be a step of 12 HU."""
     hu, _ = make_patient()
     hu[hu < -900] += 12.0  # the air of this scan: -988 HU
     assert remove_table(as_volume(hu)).report["remove_table"]["air_hu"] == pytest.approx(-988, abs=1)

@@ -20,6 +20,7 @@ from clrecon.anatomy.spine_cells import (
     measure_likeness,
     plan_cells,
 )
+from clrecon.anatomy.spine_line import _WORST
 from clrecon.geometry import Volume
 
 pytestmark = pytest.mark.unit
@@ -132,7 +133,7 @@ def test_cells_that_are_not_measured_count_as_little_as_a_cell_may(likeness):
     _, covered, worth, _ = likeness
     is_left_out = np.ones(worth.shape, bool)
     is_left_out[covered] = False
-    assert worth[is_left_out].max(initial=-1.0) < WORTH - 0.6  # from there on a path costs no more
+    assert worth[is_left_out].max(initial=-1.0) < WORTH - _WORST  # from there on a path costs no more
 
 
 @pytest.mark.release

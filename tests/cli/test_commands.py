@@ -141,7 +141,9 @@ def test_verbose_mesh_is_measured_and_its_components_are_printed(
     assert "measuring the mesh" in printed.err
 
 
-@pytest.mark.parametrize(("level", "words"), [(["--preset", "skin"], "-500 HU (preset skin)"), (["--hu", "-400"], "")])
+@pytest.mark.parametrize(
+    ("level", "words"), [(["--preset", "skin"], "-500 HU (preset skin)"), (["--hu", "-400"], "-400 HU (as given)")]
+)
 def test_mesh_of_skin_is_warned_of_as_one_that_can_show_a_face(
     device: Any, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], level: list[str], words: str
 ) -> None:

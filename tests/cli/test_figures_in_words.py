@@ -160,7 +160,9 @@ def test_output_to_standard_output_with_json_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("levels", "words"), [((200.0, 300.0), "several iso values"), ((200.0,), ""), (None, ""), ([200.0, 300.0], "")]
+    ("levels", "words"),
+    [((200.0, 300.0), "several iso values"), ((200.0,), ""), (None, ""), ([200.0, 300.0], "")],
+    ids=["two values", "one value", "none", "a range"],
 )
 def test_tuple_of_iso_values_is_said_to_make_several_meshes(levels: Any, words: str) -> None:
     options = argparse.Namespace(

@@ -141,7 +141,7 @@ def test_table_of_series_marks_the_largest_ct_and_has_its_shape_and_spacing(tabl
 
 
 def test_info_lists_series_that_are_not_read_and_describes_the_chosen_one(table_rows: list[str]) -> None:
-    assert "series 3-5: not read: modality MR is not CT" in table_rows
+    assert "series 3-5: not read: modality MR is not CT" in table_rows  # places in the list
     assert "series 1, as clrecon mesh would read it" in table_rows
     assert any(re.fullmatch(r"  slices +17 used, none dropped", row) for row in table_rows)
 

@@ -131,7 +131,7 @@ def test_several_views_are_written_to_files_named_after_them(render: Renders) ->
     assert [picture["name"] for picture in report["pictures"]] == ["anterior", "left", "az-30_el15.5"]
 
 
-def test_zoom_of_2_magnifies_the_block_about_four_times_in_area(render: Renders) -> None:
+def test_twice_the_zoom_magnifies_the_block_about_four_times_in_area(render: Renders) -> None:
     small, large = (is_lit(render.image("--zoom", zoom)).sum() for zoom in (0.5, 1.0))
     assert 3.0 < large / small < 5.0  # 2 * 2, with pixels at the rim: measured 174 / 41
 

@@ -109,7 +109,7 @@ def test_word_after_two_dashes_is_a_name_and_no_option(tmp_path: Path, printed: 
 @pytest.mark.parametrize(
     ("find_preset", "name"), [(find_level, "Cortical-BONE"), (find_look, "X-Ray")], ids=["iso value", "look"]
 )
-def test_preset_is_found_in_any_case(find_preset: Any, name: str) -> None:
+def test_preset_is_found_by_its_name_with_capital_letters(find_preset: Any, name: str) -> None:
     assert find_preset(name) is find_preset(name.lower())
 
 

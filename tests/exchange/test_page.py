@@ -238,7 +238,8 @@ def test_numbers_in_mm_come_back_from_a_page_within_half_a_step(page_of_walls):
     (values,) = decode_values(facts, coded).values()
     first_uses = list(dict.fromkeys(cube.triangles.reshape(-1).tolist()))
     expected = cube.values["thickness_mm"][first_uses]
-    half_step = 0.5 * (4.0 - 0.5) / (STEPS - 1)
+    lowest_mm, highest_mm = 0.5, 4.0  # one step is for none
+    half_step = 0.5 * (highest_mm - lowest_mm) / (STEPS - 1)
     np.testing.assert_allclose(values, expected, rtol=0.0, atol=1.001 * half_step)
 
 

@@ -100,15 +100,15 @@ def listed_measures(page) -> list[float]:
     return [float(re.search(r"[\d.]+", row.text)[0]) for row in rows]
 
 
-def test_page_shows_the_surface_on_an_even_background(page):
+def test_page_shows_the_surface_beside_its_background(page):
     shown = draw_page(page)
     background = np.full_like(shown, shown[3, 3])
     assert changed_share(shown, background) > 0.15  # sphere and box fill about a fifth of the picture
 
 
 def test_page_lists_the_parts_with_their_ml(page):
-    assert len(page.find_elements("css selector", "#parts li")) == 2
-    assert page.find_element("css selector", "#parts .ml").text == "112.9 ml"  # of the polyhedron; 113.1 of the sphere
+    of_polyhedron, of_box = "112.9 ml", "32.00 ml"  # a sphere has 113.1 ml
+    assert [part.text for part in page.find_elements("css selector", "#parts li .ml")] == [of_polyhedron, of_box]
 
 
 def test_page_tells_the_iso_value_and_shows_no_message(page):

@@ -165,7 +165,7 @@ def test_corners_of_each_slice_lie_where_the_standard_puts_them(page, volume, k)
     """PS3.3 C.7.6.2.1.1 with nothing of clrecon in it; what is left is the residual of the fit."""
     cosines, (dj, di) = page["ImageOrientationPatient"].values, page["PixelSpacing"].values
     residual, half_a_digit = page["residual_max"]
-    for i, j in ((0, 0), (5, 0), (0, 3), (5, 3)):
+    for i, j in ((0, 0), (5, 0), (0, 3), (5, 3)):  # of 6 columns and 4 rows
         expected = page[f"S_{k}"].values + np.array(cosines[:3]) * di * i + np.array(cosines[3:]) * dj * j
         assert np.linalg.norm(volume.ijk_to_lps([(i, j, k)])[0] - expected) <= residual + half_a_digit
 

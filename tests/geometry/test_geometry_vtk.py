@@ -12,6 +12,7 @@ from refusals import refused
 
 from clrecon.errors import UsageError
 from clrecon.geometry import AIR_HU, Volume, compose_affine
+from clrecon.geometry.grid import DEVICE_DTYPES
 from clrecon.geometry.resample import regular_grid, shear_degrees
 from clrecon.mesh import Mesh
 from clrecon.proof.surface.extract import extract_isosurface
@@ -107,7 +108,7 @@ def test_an_image_that_is_not_resampled_has_no_note_of_resampling(numbers_and_im
     assert "RESAMPLED" not in image.field_data
 
 
-@pytest.mark.parametrize("dtype", ["int8", "uint8", "int16", "uint16", "int32", "float32"])
+@pytest.mark.parametrize("dtype", DEVICE_DTYPES, ids=str)
 def test_an_image_shares_the_memory_of_its_volume_in_every_type(dtype):
     volume = Volume(np.arange(24, dtype=dtype).reshape(2, 3, 4), AFFINES["oblique"])
     image = volume.to_pyvista()

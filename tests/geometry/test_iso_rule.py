@@ -77,13 +77,13 @@ def test_the_value_outside_lies_half_a_unit_or_2_to_the_minus_20_of_the_level_be
     ("dtype", "low", "level", "outside"),
     [
         ("float32", -1000, 200.25, 1400.5),
-        ("float32", 300, 200.0, 200.5),
+        ("float32", 300, 200.0, 200.0 + 0.5),
         ("int16", -1000, 200.25, 1401.0),
         ("int16", -1000, 200, 1399.0),
-        ("int16", 300, 200, 200.0),
+        ("int16", 300, 200, 199.5 + 0.5),
     ],
 )
-def test_the_value_outside_of_a_surface_below_a_level_is_as_far_above_as_the_lowest_is_below(
+def test_the_value_outside_of_a_surface_below_a_level_is_as_far_above_as_the_lowest_is_below_or_half_a_unit(
     dtype, low, level, outside
 ):
     assert choose_iso_rule(make_volume(low=low, high=900, dtype=dtype), level, below=True).outside == outside
@@ -97,13 +97,14 @@ def test_the_value_outside_of_integers_lies_within_2_to_the_30_on_either_side_of
     assert choose_iso_rule(make_volume(low=-1000, high=900), level, below=below).outside == outside
 
 
-@pytest.mark.parametrize(("figure", "slices"), [("ends", 3), ("lowest", 2)])
-def test_slices_are_released_one_by_one_up_to_the_first_that_holds_air(monkeypatch, figure, slices):
-    """For the lowest value; for both ends all are looked at."""
+@pytest.mark.parametrize(("figure", "slices"), [("ends", 4), ("lowest", 2)])
+def test_slices_are_released_one_by_one_and_the_lowest_value_is_sought_up_to_the_first_with_air(
+    monkeypatch, figure, slices
+):
     released = []
     monkeypatch.setattr(Volume, "release_slices", lambda self, first, end: released.append((first, end)))
-    voxels = np.zeros((3, 4, 5), np.int16)
-    voxels[2] = AIR_HU  # no lower value matters
+    voxels = np.zeros((4, 4, 5), np.int16)
+    voxels[2] = AIR_HU  # no lower value matters: the last slice is looked at for both ends alone
     getattr(ValueRange(Volume(voxels, np.eye(4))), figure)
     assert released == [(k, k + 1) for k in range(slices)]
 

@@ -163,6 +163,7 @@ WORKERS = ["-p", "xdist", "-n", "2", "--dist", "loadfile"]
 def test_coverage_of_lines_and_branches_is_printed_before_the_last_line(
     tmp_path: Path, options: list[str], parameters: list[object], mark: str, lines: int, branches: int
 ) -> None:
+    """choose(1) runs three lines (def, if, return) and one branch; choose(3) two lines and two branches more."""
     for name, text in PROJECT.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
