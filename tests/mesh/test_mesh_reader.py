@@ -181,7 +181,7 @@ def test_a_harmed_file_is_refused_in_one_line_that_names_it(
 
 
 def test_a_format_that_is_not_read_is_refused_with_those_that_are(tmp_path: Path) -> None:
-    with refused(UsageError, ".stl", ".ply"):
+    with refused(UsageError, *MESH_INPUTS):
         clrecon.read_mesh(tmp_path / "a.off")
 
 

@@ -348,7 +348,7 @@ def test_kernels_are_refused_where_no_folder_has_room_for_them(prepare_fresh_cac
 
 
 @pytest.mark.parametrize(
-    ("ulimit", "cause"), daily_rows(1, [("-f 100", "files may have 0.10 MB here"), ("-v 500000", "want of memory")])
+    ("ulimit", "cause"), daily_rows(1, [("-f 100", "files may have 0.10 MB here"), ("-v 500000", "may take 0.51 GB")])
 )  # in blocks of 1024 bytes
 @pytest.mark.fault_row(59)
 def test_error_under_a_limit_of_the_process_names_the_limit(ulimit, cause, device, tmp_path):

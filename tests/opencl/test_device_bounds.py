@@ -82,8 +82,8 @@ def test_named_device_with_a_shortcoming_is_refused_with_its_label() -> None:
 
 
 @pytest.mark.usefixtures("three_devices")
-def test_unknown_device_index_is_refused_with_the_usable_devices() -> None:
-    with refused(DeviceError, 7, "D0", 0, "D1", 1):
+def test_unknown_device_index_is_refused_with_the_devices_and_what_one_lacks() -> None:
+    with refused(DeviceError, 7, "D0", 0, "D1", 1, "D2", 2, "compiler"):
         select.find_candidates("7")
 
 

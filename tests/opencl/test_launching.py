@@ -40,7 +40,7 @@ def sum_blocks_arguments(device):
 
 
 @pytest.mark.every_device
-def test_kernel_takes_its_arguments_by_name_in_any_order(device):
+def test_kernel_takes_its_arguments_by_name_in_reversed_order(device):
     arguments = sum_blocks_arguments(device)
     backwards = dict(reversed(arguments.items()))
     launch(device, sum_blocks_kernel(device), device.group_size, **backwards)

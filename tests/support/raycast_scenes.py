@@ -216,7 +216,12 @@ class TwinCaster:
 
 
 class DeviceCaster:
-    """Casts by `clrecon.render` on a device, over no background; light goes to the modes that have some."""
+    """Casts by `clrecon.render` on a device, over no background; light goes to the modes that have some.
+
+    slabs: Of the last picture, by its report.
+    """
+
+    slabs: int
 
     def __init__(self, device: Any):
         self.device = device
@@ -237,6 +242,7 @@ class DeviceCaster:
         elif mode == "surface":
             settings |= {"color": (1.0, 1.0, 1.0), "lighting": lighting}
         found = render(volume, mode, device=self.device, background="transparent", **settings)  # type: ignore[arg-type]
+        self.slabs = found.report["slabs"]
         values = np.full(found.depth.shape, np.nan) if found.values is None else found.values
         return Shot(found.image, found.depth, found.expected_depth, values)
 

@@ -115,7 +115,7 @@ def test_certificate_of_a_solid_surface_counts_the_spaces(solid_mesh):
 
 @pytest.mark.parametrize("spacing", [(1.3, 1.3, 1.3), (0.9, 0.9, 1.4)])
 @pytest.mark.parametrize("shift", np.random.default_rng(3).random((4, 3)).round(3).tolist())
-def test_every_pore_of_the_reported_width_is_closed_wherever_it_lies(device, spacing, shift):
+def test_a_pore_of_the_reported_width_is_closed_at_each_of_four_shifts_by_a_part_of_a_voxel(device, spacing, shift):
     """A shell from 15 to 20 mm, shifted by a part of a voxel, with a pore as wide as twice the seal less a voxel."""
     shape, closes = [int(46 / step) for step in spacing[::-1]], 2 * 2.5 - max(spacing)
     z, y, x = (

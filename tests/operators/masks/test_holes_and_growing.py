@@ -52,14 +52,14 @@ def test_filling_holes_leaves_the_mask_itself(device):
 
 @pytest.mark.every_device
 @pytest.mark.parametrize("columns", daily(4, [31, 32, 33, 512, 513, 2049]))
-def test_filled_holes_of_rows_of_every_length_equal_scipy(device, columns):
+def test_filled_holes_of_rows_around_whole_words_equal_scipy(device, columns):
     chosen = random_mask((4, 9, columns), density=0.62)
     np.testing.assert_array_equal(mask_of(device, chosen).fill_holes().to_numpy(), ndimage.binary_fill_holes(chosen))
 
 
 @pytest.mark.every_device
 @pytest.mark.parametrize("columns", daily(4, [31, 32, 33, 512, 513, 2049]))
-def test_growth_in_rows_of_every_length_equals_the_twin(device, columns):
+def test_growth_in_rows_around_whole_words_equals_the_twin(device, columns):
     chosen = random_mask((4, 9, columns), density=0.62)
     mask = mask_of(device, chosen)
     seeds = np.argwhere(chosen)[[0, -1]]  # k, j, i
@@ -162,7 +162,7 @@ def test_growth_in_an_empty_mask_is_refused(one_voxel):
 
 def test_filling_holes_without_room_on_the_device_is_refused(one_voxel):
     small = clrecon.Mask(one_voxel.scan, one_voxel.bits.mask_d, "", device=one_voxel.device, memory=900)
-    with refused(DeviceError, 900):
+    with refused(DeviceError, "masks", "rows", 900):
         small.fill_holes()
 
 

@@ -66,7 +66,7 @@ def test_field_of_points_with_random_normals_equals_the_twin(device, n):
 
 
 @pytest.mark.oclgrind
-def test_small_field_of_every_kernel_equals_the_twin(device):
+def test_field_of_a_small_sphere_equals_the_twin(device):
     assert_field_equals_twin(device, sphere_cloud(150, radius=2.5), settings_of_spacing(0.9))
 
 
@@ -188,7 +188,7 @@ def test_too_many_nodes_are_refused_with_the_most_allowed():
         plan_nodes(plan_grid(FAR_CORNERS, edge=1.0), settings_of_spacing(0.5))
 
 
-def test_as_many_nodes_as_allowed_are_planned():
+def test_nearly_as_many_nodes_as_allowed_are_planned():
     """Some 1210 nodes 0.75 mm apart along each side of 900 mm."""
     nodes = plan_nodes(plan_grid(FAR_CORNERS, edge=1.5), settings_of_spacing(0.75))
     assert 1200**3 < nodes.count <= MOST_NODES

@@ -78,11 +78,12 @@ def test_one_foreign_slice_among_rods_is_found_with_its_figures(device, kind, at
     found = find_ghost_slices(volume, BONE, device=device)
     assert found.slices == (at,)
 
-    (entry,) = found.as_dict()["ghost_slices"]
+    facts = found.as_dict()
+    (entry,) = facts["ghost_slices"]
     assert (entry["slice"], entry["points"]) == (at, np.count_nonzero(volume.voxels[at] >= BONE[0]))
-    # A ghost is less than 0.75 times as like its neighbours as they are like each other; other slices are more.
-    assert entry["dice_with_neighbour"] < 0.75 * entry["dice_of_neighbours"]
-    assert found.as_dict()["least_share_of_others"] > 0.75
+    # A ghost is less than this share as like its neighbours as they are like each other; other slices are more.
+    assert entry["dice_with_neighbour"] < facts["ghost_share"] * entry["dice_of_neighbours"]
+    assert facts["least_share_of_others"] > facts["ghost_share"]
 
 
 @pytest.mark.parametrize(

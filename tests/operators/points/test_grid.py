@@ -57,7 +57,7 @@ def test_grid_of_rows_around_whole_words_equals_the_twin(device, cells):
 
 
 @pytest.mark.oclgrind
-def test_small_grid_of_every_kernel_equals_the_twin(device):
+def test_grid_of_a_small_cloud_equals_the_twin(device):
     assert_grid_equals_twin(device, scattered_points(700), edge=2.0)
 
 
@@ -148,11 +148,12 @@ def test_grid_of_too_many_cells_along_an_axis_is_refused_with_their_number():
 
 def test_grid_of_as_many_cells_along_an_axis_as_allowed_is_planned():
     along_y = LINE[:, [1, 0, 2]]
-    assert plan_grid(along_y, edge=1.00001).shape == (1, MOST_CELLS_ALONG - 1, 1)
+    along_y[1, 1] -= 0.5  # mm, of cells of 1 mm
+    assert plan_grid(along_y, edge=1.0).shape == (1, MOST_CELLS_ALONG, 1)
 
 
 def test_grid_of_cells_so_small_that_their_number_overflows_is_refused():
-    with refused(UsageError, 1e-36):
+    with refused(UsageError, 1e-36, MOST_CELLS):
         plan_grid(CORNERS, edge=1e-36)
 
 

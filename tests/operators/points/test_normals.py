@@ -233,7 +233,7 @@ def test_doubtful_normals_are_warned_of_where_slices_lie_ten_pixels_apart(device
     volume, shell = shell_of_a_cylinder(device, slice_gap)
     step = estimate_normals(shell, volume=volume, device=device)
     share = step.facts["doubtful"] / len(shell)
-    assert (share > 0.1) == warned  # measured none, and 0.129
+    assert (share > 0.1) == warned  # the share from which on there is a warning; measured none, and 0.129
     assert [f"({100.0 * share:.0f} %) are doubtful" in warning for warning in step.warnings] == [True] * warned
 
 
@@ -274,7 +274,7 @@ def points_on_lines(seed):
 
 @pytest.mark.every_device
 @pytest.mark.parametrize("k", daily(2, [3, 5, 16, 64]))
-def test_points_on_lines_of_any_direction_have_no_normal(device, k):
+def test_points_on_lines_of_24_directions_have_no_normal(device, k):
     points = points_on_lines(k)
     step = estimate_normals(PointCloud(points), k=k, device=device)
     assert not step.cloud.normals.any()
@@ -282,7 +282,7 @@ def test_points_on_lines_of_any_direction_have_no_normal(device, k):
 
 
 @pytest.mark.parametrize("k", daily(2, [3, 5, 16, 64]))
-def test_points_on_lines_of_any_direction_have_no_principal_axis_of_the_twin(k):
+def test_points_on_lines_of_24_directions_have_no_principal_axis_of_the_twin(k):
     points = points_on_lines(k)
     axes, _ = axes_by_twin(points, k=k)
     assert not axes.any()

@@ -127,8 +127,10 @@ def test_a_whole_ball_is_not_warned_of(device):
 def test_a_sphere_without_its_upper_quarter_is_refused_after_all_widenings(device):
     cloud = sphere_cloud(3000, radius=10.0)
     open_top = cloud.select(np.flatnonzero(cloud.points[:, 2] < 5.0))
-    with refused(RefusedInputError, SPACING_MM):
+    with refused(RefusedInputError, "tries", 1 + 3) as caught:
         reconstruct_surface(open_top, SPACING_MM, device=device)
+    widest_bridge_mm = 2 * SPACING_MM * 1.25**3
+    assert f"bridge {widest_bridge_mm:.3f} mm" in str(caught.value)
 
 
 def test_normals_that_point_inward_are_refused(device):

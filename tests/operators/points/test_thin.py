@@ -8,7 +8,7 @@ from point_grids import scattered_points
 from refusals import refused
 
 from clrecon.errors import DeviceMemoryError, UsageError
-from clrecon.operators.points.grid import plan_grid
+from clrecon.operators.points.grid import MOST_CELLS, MOST_CELLS_ALONG, plan_grid
 from clrecon.operators.points.thinning import choose_points, thin_points
 from clrecon.points import PointCloud
 from clrecon.proof.points import clusters as twin
@@ -101,7 +101,7 @@ def test_thinning_of_an_empty_cloud_is_refused():
 
 
 def test_spacing_that_needs_too_many_cells_is_refused(device):
-    with refused(UsageError, "cells", 0.0001):
+    with refused(UsageError, 0.0001, MOST_CELLS, MOST_CELLS_ALONG):
         thin_points(scattered_points(10), spacing=1e-4, device=device)
 
 

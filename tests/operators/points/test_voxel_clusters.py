@@ -68,7 +68,7 @@ def test_clusters_of_random_voxels_equal_the_twin(device, density, samples):
 
 
 @pytest.mark.parametrize("columns", [1, 31, 32, 33, 63, 64, 65, 255, 256, 257])
-def test_clusters_of_rows_of_every_length_equal_the_twin(device, columns):
+def test_clusters_of_rows_around_whole_words_equal_the_twin(device, columns):
     """The mask holds 32 columns in a word."""
     assert_clusters_equal_twin(device, Volume(random_voxels((3, 5, columns), density=0.4), FINE), eps=0.9, samples=5)
 
@@ -147,7 +147,7 @@ def test_clusters_on_devices_with_small_work_groups_equal_the_twin(device, group
 
 
 @pytest.mark.parametrize("parts_per_core", [1, 7, 1000])
-def test_labels_of_clusters_found_in_parts_of_any_size_are_those_of_the_default(device, parts_per_core):
+def test_labels_of_clusters_found_in_1_7_or_1000_parts_a_core_are_those_of_the_default(device, parts_per_core):
     volume = Volume(random_voxels((6, 9, 70), density=0.3), FINE)
     labels = search(device, volume, eps=1.2, samples=5, parts_per_core=parts_per_core).label()
     np.testing.assert_array_equal(labels, search(device, volume, eps=1.2, samples=5).label())
@@ -171,7 +171,7 @@ def test_clusters_of_every_voxel_type_equal_the_twin(device, dtype):
     low, high = 30.5, 60
     voxels = np.random.default_rng(1).integers(0, 100, (4, 6, 40)).astype(dtype)
     inside = (voxels >= low) & (voxels <= high)
-    points = Volume(inside, FINE).ijk_to_lps(np.argwhere(inside)[:, ::-1])
+    points = Volume(inside, FINE).ijk_to_lps(np.argwhere(inside)[:, ::-1])  # k, j, i to i, j, k
 
     step = cluster_points(Volume(voxels, FINE), eps=0.8, min_samples=3, hu=(low, high), device=device)
 

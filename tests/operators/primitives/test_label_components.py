@@ -195,7 +195,7 @@ def test_a_device_too_small_for_components_is_refused_before_memory_is_taken(dev
 
 
 def test_too_little_memory_allowed_for_components_is_refused(device):
-    with refused(DeviceMemoryError, 15_000):
+    with refused(DeviceMemoryError, "components", "labels", 15_000):
         label_components(device, random_triangles(vertices=1000, triangles=10), 1000, memory=15_000)
 
 

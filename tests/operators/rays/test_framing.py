@@ -132,7 +132,8 @@ def test_box_of_a_scene_holds_the_rest_of_a_clipped_volume_and_its_meshes(two_bl
     look = clrecon.VolumeLook(clip=Clip.box((0, 0, 0), (30, 30, 30)))
     mesh = clrecon.Mesh([(20.0, 0, 0), (30, 0, 0), (30, 9, 9)], [(0, 1, 2)])
     box = _box_of([(volume, look), (mesh, clrecon.MeshLook())])
-    ends = box.affine[:3, 3] + 0.5 * np.diag(box.affine)[:3]
+    first_centre, voxel = box.affine[:3, 3], np.diag(box.affine)[:3]  # of a box of a single voxel
+    ends = first_centre + 0.5 * voxel
     assert np.allclose(ends, (30.0, 8 * MM, 8 * MM))
 
 

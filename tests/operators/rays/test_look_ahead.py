@@ -114,6 +114,7 @@ def test_box_of_leaps_holds_the_bright_bricks_and_half_a_voxel(device, shape):
         assert (low[axis], high[axis]) == (4 * bricks.min() - 0.5, 4 * (bricks.max() + 1) + 0.5)
 
 
+LEAST_DRIFT = 0.02  # bricks to the side per brick ahead, below which a ray counts as straight, see `MainWay`
 FRONT, MIDDLE, HEAD = (15.0, -400.0, 30.0), (15.0, 0.0, 30.0), (0.0, 0.0, 1.0)
 
 
@@ -130,14 +131,14 @@ def test_main_way_of_a_parallel_camera_runs_along_its_rays(device):
     along_rows, backwards = 1, -1
     assert (way.axis, way.ahead) == (along_rows, backwards)
     assert way.eye.tolist() == [0.0, -1.0, 0.0, 0.0]  # a direction
-    assert way.aside == 0.02
+    assert way.aside == LEAST_DRIFT
 
 
 def test_main_way_of_a_perspective_camera_runs_from_its_position_in_bricks(device):
     way = main_way(device, Camera(FRONT, MIDDLE, HEAD, view_angle=30.0))
     assert (way.axis, way.ahead) == (1, -1)
     assert way.eye.tolist() == [15 / 4, 200 / 4, 10 / 2, 1.0]  # column 15, row 200, slice 10; a place
-    assert way.aside == pytest.approx(0.02 * 40.0)  # 200 voxels away, of which 40 are the volume's
+    assert way.aside == pytest.approx(LEAST_DRIFT * 40.0)  # 200 voxels away, of which 40 are the volume's
 
 
 def test_main_way_of_a_camera_within_the_volume_leaves_half_a_brick_aside(device):

@@ -165,11 +165,12 @@ def test_leaps_along_free_ways_hide_no_voxel_from_anywhere(device, monkeypatch):
 
 
 @pytest.mark.oclgrind
-def test_opaque_voxels_are_opaque_in_the_shortest_last_segment_of_a_ray(device):
+def test_opaque_voxels_are_opaque_in_a_last_segment_of_a_hundredth_of_a_step(device):
+    """Rays enter at z = -0.5, and the last whole step ends at 9.5, where the HU reach 500: opaque from there on."""
     voxels = np.zeros((20, 6, 6), np.int16)
     voxels[10:] = 1000
     camera = Camera((2.5, 2.5, -20.0), (2.5, 2.5, 0.0), (0.0, -1.0, 0.0), parallel_scale=2.0)
-    clip = Clip.plane((0.0, 0.0, 9.51), (0.0, 0.0, -1.0))  # a hundredth of a step over the samples at whole numbers
+    clip = Clip.plane((0.0, 0.0, 9.51), (0.0, 0.0, -1.0))  # what lies below stays
     picture = take_picture(Volume(voxels, np.eye(4)), device, camera, size=(4, 4), ray_step=1.0, clip=clip)
     assert (picture.image[..., 3] == 255).all()
 
@@ -190,7 +191,7 @@ def test_slabs_of_rays_almost_along_the_slices_give_the_picture_of_the_whole(dev
     assert_same(parts, whole)
 
 
-def test_labels_of_a_single_slice_colour_every_picture(device):
+def test_labels_of_a_single_slice_colour_four_pictures_of_a_renderer_alike(device):
     """A single slice is doubled on its way to the device: CPU devices read the copy in place, and it must stay."""
     labels = LabelMap(np.ones((1, 1100, 1100), np.uint8), np.eye(4))
     volume = Volume(np.full((1, 1100, 1100), 1000, np.int16), np.eye(4))

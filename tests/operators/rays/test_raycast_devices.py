@@ -227,7 +227,7 @@ def test_pictures_of_one_camera_are_the_same_each_time(device):
 
 @pytest.mark.every_device
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (8, 8), (9, 7), (65, 33)])
-def test_pictures_of_any_size_have_all_their_pixels(device, size):
+def test_pictures_of_1_to_65_x_33_pixels_have_all_their_pixels(device, size):
     volume = even_volume(lambda p: np.zeros(len(p)), "oblique", extent=12.0, dtype=np.int16)
     fog = TransferFunction([(-10, 1, 1, 1, 0.2), (10, 1, 1, 1, 0.2)])
     camera = Camera.fit(volume, view=(20.0, 30.0), zoom=6.0, size=size)
