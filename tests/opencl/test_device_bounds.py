@@ -263,6 +263,7 @@ def test_kernels_are_read_beside_the_sources_where_they_are_not_installed(monkey
 def test_arrays_from_the_least_size_on_are_read_in_pieces_but_from_simulators(
     size: int, simulator: bool, way: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """By stand-ins for both ways: a copy by the driver, and pieces by pinned memory; the choice alone is real."""
     ways: list[str] = []
     opencl = SimpleNamespace(
         mem_flags=SimpleNamespace(USE_HOST_PTR=8), enqueue_copy=lambda *given, **more: ways.append("copy")

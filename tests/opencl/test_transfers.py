@@ -102,7 +102,7 @@ def test_pinned_piece_is_not_filled_again_before_it_was_copied_to_its_array(card
         return event
 
     monkeypatch.setattr(cl, "enqueue_copy", copy_and_wait)
-    card.of_context(PinnedPieces)._pieces.clear()
+    card.of_context(PinnedPieces)._pieces.clear()  # begin with none
     download_all(card, *reads)
 
     for (read, _, _), array in zip(reads, arrays, strict=True):
@@ -128,7 +128,7 @@ def test_pinned_piece_is_not_filled_again_before_it_was_sent_to_the_card(card, m
         return CopySeenLate()
 
     monkeypatch.setattr(ThreadPoolExecutor, "submit", copy_at_once)
-    card.of_context(PinnedPieces)._pieces.clear()
+    card.of_context(PinnedPieces)._pieces.clear()  # begin with none
     array = random_bytes(9 * PIECE_BYTES + 5)
     array_d = upload(card, array)
     assert np.array_equal(download(card, np.empty_like(array), array_d), array)

@@ -153,6 +153,7 @@ def count_crossings(vertices: np.ndarray, mesh: Mesh) -> int:
 
 def test_the_filter_alone_moves_a_sheet_through_another(sheets_that_nearly_touch):
     mesh = sheets_that_nearly_touch
+    # The steps of the filter as `smooth_mesh` finds them, in its 20 iterations, before any is taken back.
     low_pass = Filter(Rings.of(mesh.triangles, mesh.vertex_count))
     step = low_pass.find_steps(low_pass.measure_bends(mesh.vertices)[0], sinc_terms(20))
     assert count_crossings(mesh.vertices, mesh) == 0

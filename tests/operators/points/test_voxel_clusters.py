@@ -35,10 +35,12 @@ def random_voxels(shape: tuple[int, int, int], *, density: float) -> np.ndarray:
 
 
 def points_of_ones(volume: Volume) -> np.ndarray:
-    return volume.ijk_to_lps(np.argwhere(volume.voxels > 0)[:, ::-1])
+    """Places of the voxels of 1 in LPS mm, in their order in memory."""
+    return volume.ijk_to_lps(np.argwhere(volume.voxels > 0)[:, ::-1])  # k, j, i to i, j, k
 
 
 def search(device, volume: Volume, *, eps: float, samples: int, **parts: int) -> ClusterSearch:
+    """The search for clusters of the voxels of 1, as `cluster_points` begins it."""
     stencil = make_stencil(Lattice.of(volume), eps)
     with DeviceVolume(volume, device=device) as resident:
         mask = mark_band(resident, (1.0, 1.0), pad=pad_for(stencil))

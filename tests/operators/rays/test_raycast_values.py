@@ -205,6 +205,7 @@ def test_extremes_along_axes_are_those_of_numpy(cast, mode, extreme, towards, up
         volume, mode, camera=look(volume, towards, half_height=0.25 * size[1], up=up), size=size, ray_step=ray_step
     )
 
+    # Pixels at the centres of voxels, which are k, j, i: turned and mirrored to rows downward, columns to the right.
     pixels_a_voxel = (spacing / pixel).astype(int)
     row, column = pixels_a_voxel[along], pixels_a_voxel[across]
     found = shot.values[row // 2 :: row, column // 2 :: column]
