@@ -358,11 +358,14 @@ def test_two_processes_that_each_asked_whether_they_are_alone_still_see_each_oth
     assert first._is_alone()
 
 
-def test_process_records_its_programs_before_its_end_only_after_some_seconds(new_process, tmp_path, monkeypatch):
+def test_process_records_its_programs_before_its_end_only_after_5_seconds(new_process, tmp_path, monkeypatch):
+    now = 100.0
+    monkeypatch.setattr(pocl.time, "perf_counter", lambda: now)
     store = new_process()
     build_program(store, tmp_path)
+    now += 5.0
     store.record_when_due()
     assert not (tmp_path / "records" / KEY).exists()
-    monkeypatch.setattr(pocl.time, "perf_counter", lambda: float("inf"))
+    now += 0.1
     store.record_when_due()
     assert (tmp_path / "records" / KEY).exists()

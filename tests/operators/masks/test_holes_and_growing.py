@@ -79,8 +79,9 @@ def test_holes_of_a_chess_board_are_filled_except_at_its_border(device):
 
 def test_seeds_on_a_chess_board_grow_to_themselves_alone(device):
     mask = mask_of(device, CHESS_BOARD)
-    two_seeds = [[2, 2, 2], [5, 4, 3]]  # their sums are even: both are chosen
-    assert mask.grow(mask.scan.ijk_to_lps(two_seeds)).count == 2
+    two_seeds = [[2, 4, 2], [5, 2, 3]]  # i, j, k, whose sums are even: both are chosen
+    grown = mask.grow(mask.scan.ijk_to_lps(two_seeds))
+    assert np.argwhere(grown.to_numpy())[:, ::-1].tolist() == two_seeds
 
 
 @pytest.mark.parametrize("density", [0.4, 0.7])

@@ -115,7 +115,7 @@ def test_two_runs_of_a_row_are_joined_by_a_voxel_between_them_in_the_next_row(de
 
 
 @pytest.mark.parametrize(("middle", "clusters"), [("whole", 1), ("cut", 2)])
-def test_path_through_all_rows_and_slices_is_one_cluster_and_two_where_it_is_cut(device, middle, clusters):
+def test_path_back_and_forth_through_rows_and_slices_is_one_cluster_and_two_where_it_is_cut(device, middle, clusters):
     """A path back and forth through every second row of every second slice, joined at the ends of rows and slices."""
     voxels = np.zeros((9, 63, 65), np.int16)
     voxels[:, ::2] = 1
