@@ -42,6 +42,7 @@ def count_by_solving(vertices: np.ndarray, triangles: np.ndarray) -> int:
 
 
 def _edge_meets(face: np.ndarray, corners: np.ndarray, edge: int) -> bool:
+    """Whether an edge passes through the face: both weights of its place and the share of the edge, solved for."""
     start, end = corners[edge], corners[(edge + 1) % 3]
     matrix = np.column_stack([face[1] - face[0], face[2] - face[0], start - end])
     if abs(np.linalg.det(matrix)) < 1e-12:
@@ -59,6 +60,7 @@ def count_exactly(vertices: np.ndarray, triangles: np.ndarray) -> int:
 
 
 def _meet_exactly(one, other) -> bool:
+    """Triangles with a common edge meet where they are folded flat onto each other, others where an edge meets."""
     common = set(one) & set(other)
     if len(common) == 2:
         own, its = (next(corner for corner in triangle if corner not in common) for triangle in (one, other))

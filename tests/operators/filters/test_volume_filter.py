@@ -39,6 +39,7 @@ def ball(*, shape=(SLICES, ROWS, COLUMNS), noise=25.0, dtype="int16", affine=Non
 def filter_with_settings(
     device, volume, *, sigma_hu=40.0, sigma_mm=None, dimensions=3, near=None, normals=False, taps=None
 ):
+    """Return the filtered volume, as `run_bilateral` has it, and the settings with their window."""
     settings = BilateralSettings.checked(volume, sigma_mm, sigma_hu, dimensions, near, normals, taps)
     with DeviceVolume(volume, device=device) as resident:
         return run_bilateral(resident, settings), settings

@@ -201,6 +201,7 @@ def test_too_little_memory_for_a_search_for_neighbours_is_refused(device):
 
 
 def clouds_of_30_000_points(seed):
+    """In a cube, and in a sheet of 0.05 mm; and the sheet with 2,000 more at the origin."""
     rng = np.random.default_rng(seed)
     box = rng.uniform(0, 60, (30_000, 3))
     sheet = np.c_[rng.uniform(0, 90, (30_000, 2)), rng.normal(0, 0.05, 30_000)]

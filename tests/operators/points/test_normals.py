@@ -115,6 +115,7 @@ SLOPE = np.array([3.0, -2.0, 1.5])  # HU a mm along x, y and z
 
 
 def linear_field_in_uneven_slices(sign):
+    """HU that rise by `SLOPE` with the place of each voxel; slices follow the normal, or run against it by -1."""
     empty = uneven(sign=sign)
     nk, nj, ni = empty.voxels.shape
     index = np.stack(np.meshgrid(np.arange(ni), np.arange(nj), np.arange(nk), indexing="ij"), -1)

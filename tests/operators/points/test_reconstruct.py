@@ -25,6 +25,7 @@ def sphere_error(mesh, *, radius):
 
 
 def assert_closed(mesh, components=1):
+    """The mesh is closed, manifold and of that many components."""
     quality = mesh.quality()
     assert quality.closed
     assert quality.manifold

@@ -25,6 +25,7 @@ BRIGHT = TransferFunction([(400.0, 1.0, 1.0, 1.0, 0.0), (500.0, 1.0, 0.5, 0.2, 1
 
 
 def take_picture(volume: Volume, device, camera: Camera, **settings) -> Rendering:
+    """Volume rendering by `BRIGHT` without light, over no background."""
     return render(
         volume, transfer_function=BRIGHT, camera=camera, device=device, lighting=UNSHADED, background="transparent",
         **settings,
