@@ -242,7 +242,7 @@ def test_unsigned_number_of_another_length_is_refused(raw, vr):
 @pytest.mark.parametrize(
     ("raw", "vr"), [(b"\x30\xf8", "SS"), (b"\x30\xf8", "US"), (b"\x30\xf8\xff\xff", "UL"), (b"\x30\xf8", "OW")]
 )
-def test_padding_value_is_read_as_signed_from_any_binary_form(raw, vr):
+def test_padding_value_is_read_as_signed_from_ss_us_ul_and_ow(raw, vr):
     values = values_of(padding=(0x00280120, raw, vr))
     assert values.padding(bits_allocated=16, bits_stored=16, signed=True) == (-2000, -2000)  # lowest and highest
 

@@ -79,8 +79,10 @@ def damage_last(plan, folder, damage):
 def test_series_with_remains_of_its_last_slice_is_refused_until_they_are_removed(series_named, damage):
     plan, folder = series_named
     file = damage_last(plan, folder, damage)
-    with refused(RefusedInputError, file.name):
+    _, reason = DAMAGE[damage]
+    with refused(RefusedInputError, file.name) as refusal:
         read_volume(folder)
+    assert reason in str(refusal.value)
     file.unlink()
     assert read_volume(folder).voxels.shape[0] == COUNT - 1
 

@@ -87,12 +87,12 @@ def test_series_of_similar_size_in_different_directions_is_read_by_its_number(tm
 
 
 def test_one_file_of_a_series_is_refused_with_the_advice_to_name_the_folder(series_of_7_and_4):
-    with refused(RefusedInputError, "slice", "names"):
+    with refused(RefusedInputError, "single", "folder"):
         read_volume(series_of_7_and_4 / "a0")
 
 
 def test_folder_of_one_slice_is_refused_without_the_advice_to_name_a_folder(series_of_7_and_4):
     write_series(series_of_7_and_4 / "lone", Plan(series=9, shape=(1, 5, 6)))
-    with refused(RefusedInputError, "slice") as refusal:
+    with refused(RefusedInputError, "single") as refusal:
         read_volume(series_of_7_and_4 / "lone")
     assert "folder" not in repr(refusal.value)

@@ -121,13 +121,14 @@ def test_opacity_of_preset_x_ray_grows_with_hu() -> None:
     assert opacity[0] == 0 and np.all(np.diff(opacity) > 0)
 
 
-def test_page_of_transfer_functions_has_mode_and_first_hu_of_each_preset() -> None:
+def test_page_of_transfer_functions_has_the_mode_of_each_preset_and_the_first_hu_of_volume_rendering() -> None:
     text = DOCUMENT.read_text(encoding="utf-8")
     rows = re.findall(r"^\| `([\w-]+)` \| (.*?) \| (\w+) \| (.*?) ?\|$", text, re.MULTILINE)
     assert [row[0] for row in rows] == NAMES
     for name, description, mode, begins in rows:
         preset = PRESETS[name]
         assert preset.description.startswith(description) and preset.mode == mode
+        assert bool(begins) == (mode == "dvr")
         if begins:
             hu, *_, opacities = preset.transfer_function.points.T
             first_opaque = np.flatnonzero(opacities > 0)[0]
