@@ -382,21 +382,21 @@ def test_impossible_fit_is_refused(arguments, message):
 
 
 IMPOSSIBLE_CAMERAS = {
-    "position at the focal point": {"position": (0, 0, 0)},
-    "position of no number": {"position": (0, 0, np.nan)},
-    "top along the view": {"up": (0, 1, 0)},
-    "top of no direction": {"up": (0, 0, 0)},
-    "perspective and parallel": {"view_angle": 30, "parallel_scale": 10},
-    "view angle 0": {"view_angle": 0},
-    "view angle in words": {"view_angle": "wide"},
-    "negative scale": {"parallel_scale": -1},
-    "infinite scale": {"parallel_scale": np.inf},
+    "position at the focal point": ({"position": (0, 0, 0)}, "focal"),
+    "position of no number": ({"position": (0, 0, np.nan)}, "position"),
+    "top along the view": ({"up": (0, 1, 0)}, "up"),
+    "top of no direction": ({"up": (0, 0, 0)}, "up"),
+    "perspective and parallel": ({"view_angle": 30, "parallel_scale": 10}, "both"),
+    "view angle 0": ({"view_angle": 0}, "angle"),
+    "view angle in words": ({"view_angle": "wide"}, "angle"),
+    "negative scale": ({"parallel_scale": -1}, "scale"),
+    "infinite scale": ({"parallel_scale": np.inf}, "scale"),
 }
 
 
-@pytest.mark.parametrize("arguments", IMPOSSIBLE_CAMERAS.values(), ids=IMPOSSIBLE_CAMERAS)
-def test_impossible_camera_is_refused(arguments):
-    with refused(UsageError, "camera"):
+@pytest.mark.parametrize(("arguments", "fact"), IMPOSSIBLE_CAMERAS.values(), ids=IMPOSSIBLE_CAMERAS)
+def test_impossible_camera_is_refused(arguments, fact):
+    with refused(UsageError, "camera", fact):
         Camera(**{**FROM_THE_FRONT, **arguments})
 
 

@@ -162,38 +162,47 @@ CIRCLE = {"kind": "circle", "name": "a", "thickness_mm": 0}
 PART = {"key": "2", "kind": "mesh", "number": 0, "inside_lps_mm": None, "color": None, "opacity": 1, "visible": 1}
 CAMERA = {"up_lps": [0, 0, 1], "view_angle_deg": None, "parallel_scale_mm": 9}
 
-DAMAGED: dict[str, dict[str, Any]] = {
-    "mode unknown": {"mode": "x-ray vision"},
-    "iso value outside of the slider": {"iso_value_hu": 1e9},
-    "iso value as text": {"iso_value_hu": "high"},
-    "window turned round": {"window_hu": [300, -100]},
-    "window of one number": {"window_hu": [300]},
-    "cross of two numbers": {"cross_lps_mm": [1, 2]},
-    "zoom of a slice below its least": {"slices": [{"plane": "axial", "zoom": 0, "center_lps_mm": [0, 0, 0]}]},
-    "plane unknown": {"slices": [{"plane": "oblique", "zoom": 1, "center_lps_mm": [0, 0, 0]}]},
-    "turn that is none": {"turn": [[1, 0, 0], [0, 2, 0], [0, 0, 1]]},
-    "slab of an unknown kind": {"slab": {"thickness_mm": 5, "combine": "median"}},
-    "slab of a metre": {"slab": {"thickness_mm": 1000, "combine": "mean"}},
-    "layout unknown": {"layout": "9"},
-    "clip beyond its ends": {"clips": [{"direction": "left", "share": 2, "flipped": False}]},
-    "clip without a share": {"clips": [{"direction": "left", "flipped": False}]},
-    "measure of one point": {"measures": [{"kind": "distance", "name": "a", "points_lps_mm": [[0, 0, 0]]}]},
-    "measure of an unknown kind": {"measures": [{"kind": "area", "name": "a", "points_lps_mm": []}]},
-    "circle of two radii": {"measures": [{**CIRCLE, "points_lps_mm": [[0, 0, 0], [5, 0, 0], [0, 6, 0]]}]},
-    "part of no object": {"parts": [{**PART, "key": "7"}]},
-    "opacity above 1": {"parts": [{**PART, "opacity": 2}]},
-    "camera in its focal point": {"camera": {**CAMERA, "position_lps_mm": [0, 0, 0], "focal_point_lps_mm": [0, 0, 0]}},
-    "camera missing": {"camera": None},
-    "clips that are no list": {"clips": 3},
+DAMAGED: dict[str, tuple[dict[str, Any], str]] = {
+    "mode unknown": ({"mode": "x-ray vision"}, "x-ray"),
+    "iso value outside of the slider": ({"iso_value_hu": 1e9}, "1,000,000,000"),
+    "iso value as text": ({"iso_value_hu": "high"}, "high"),
+    "window turned round": ({"window_hu": [300, -100]}, "black"),
+    "window of one number": ({"window_hu": [300]}, "damaged"),
+    "cross of two numbers": ({"cross_lps_mm": [1, 2]}, "cross"),
+    "zoom of a slice below its least": (
+        {"slices": [{"plane": "axial", "zoom": 0, "center_lps_mm": [0, 0, 0]}]},
+        "zoom",
+    ),
+    "plane unknown": ({"slices": [{"plane": "oblique", "zoom": 1, "center_lps_mm": [0, 0, 0]}]}, "oblique"),
+    "turn that is none": ({"turn": [[1, 0, 0], [0, 2, 0], [0, 0, 1]]}, "rotation"),
+    "slab of an unknown kind": ({"slab": {"thickness_mm": 5, "combine": "median"}}, "median"),
+    "slab of a metre": ({"slab": {"thickness_mm": 1000, "combine": "mean"}}, "thick"),
+    "layout unknown": ({"layout": "9"}, "layout"),
+    "clip beyond its ends": ({"clips": [{"direction": "left", "share": 2, "flipped": False}]}, "place"),
+    "clip without a share": ({"clips": [{"direction": "left", "flipped": False}]}, "share"),
+    "measure of one point": (
+        {"measures": [{"kind": "distance", "name": "a", "points_lps_mm": [[0, 0, 0]]}]},
+        "distance",
+    ),
+    "measure of an unknown kind": ({"measures": [{"kind": "area", "name": "a", "points_lps_mm": []}]}, "area"),
+    "circle of two radii": ({"measures": [{**CIRCLE, "points_lps_mm": [[0, 0, 0], [5, 0, 0], [0, 6, 0]]}]}, "middle"),
+    "part of no object": ({"parts": [{**PART, "key": "7"}]}, "part"),
+    "opacity above 1": ({"parts": [{**PART, "opacity": 2}]}, "opacity"),
+    "camera in its focal point": (
+        {"camera": {**CAMERA, "position_lps_mm": [0, 0, 0], "focal_point_lps_mm": [0, 0, 0]}},
+        "focal",
+    ),
+    "camera missing": ({"camera": None}, "damaged"),
+    "clips that are no list": ({"clips": 3}, "damaged"),
 }
 
 
-@pytest.mark.parametrize("entries", DAMAGED.values(), ids=DAMAGED)
-def test_damaged_view_is_refused_and_changes_nothing(entries: dict[str, Any]) -> None:
+@pytest.mark.parametrize(("entries", "fact"), DAMAGED.values(), ids=DAMAGED)
+def test_damaged_view_is_refused_and_changes_nothing(entries: dict[str, Any], fact: str) -> None:
     model = make_model()
     saved, before = {**save(model), **entries}, model.state
 
-    with refused(RefusedInputError, "view"):
+    with refused(RefusedInputError, "view", fact):
         restore_view(saved, model)
 
     assert model.state is before

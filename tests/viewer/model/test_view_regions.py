@@ -141,19 +141,19 @@ def test_first_point_of_a_circle_on_another_slice_is_moved_into_that_of_the_seco
 
 
 REFUSED = {
-    "in the picture": ("circle", (0.0, 0.0, 0.0), (5.0, 0.0, 0.0), None),
-    "no radius": ("circle", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (X, -Y)),
-    "a line": ("box", (0.0, 0.0, 0.0), (5.0, 0.0, 0.0), (X, -Y)),
-    "beside the scan": ("circle", (900.0, 0.0, 0.0), (905.0, 0.0, 0.0), (X, -Y)),
-    "between voxels": ("circle", (0.3, 0.3, 0.0), (0.31, 0.3, 0.0), (X, -Y)),
+    "in the picture": ("circle", (0.0, 0.0, 0.0), (5.0, 0.0, 0.0), None, "slice"),
+    "no radius": ("circle", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (X, -Y), "area"),
+    "a line": ("box", (0.0, 0.0, 0.0), (5.0, 0.0, 0.0), (X, -Y), "area"),
+    "beside the scan": ("circle", (900.0, 0.0, 0.0), (905.0, 0.0, 0.0), (X, -Y), "voxel"),
+    "between voxels": ("circle", (0.3, 0.3, 0.0), (0.31, 0.3, 0.0), (X, -Y), "voxel"),
 }
 
 
-@pytest.mark.parametrize(("tool", "first", "second", "axes"), REFUSED.values(), ids=REFUSED)
-def test_region_that_measures_nothing_is_refused_and_leaves_the_measures(tool, first, second, axes) -> None:
+@pytest.mark.parametrize(("tool", "first", "second", "axes", "fact"), REFUSED.values(), ids=REFUSED)
+def test_region_that_measures_nothing_is_refused_and_leaves_the_measures(tool, first, second, axes, fact) -> None:
     model = make_model(make_noise(np.eye(4)))
 
-    with refused(UsageError, tool):
+    with refused(UsageError, tool, fact):
         draw(model, tool, first, second, axes)
 
     assert model.state.measures == ()

@@ -134,8 +134,8 @@ OUTSIDE = {
     "this folder": "./x.stl",
     "end of line": "x\n.stl",
     "zero": "x\0.stl",
-    "long name": "x" * 300,
-    "deep folders": "/".join("x" * 17),
+    "long name": "x" * 201,  # letters, up to 200
+    "deep folders": "/".join("x" * 17),  # up to 16
 }
 
 
