@@ -113,4 +113,4 @@ def test_surface_of_the_selected_scan_lies_on_it_in_napari(
     volume: Volume = read_volume(sphere_series)
     places = surface.data[0][:, ::-1]  # x, y, z of napari's z, y, x
     radii = np.linalg.norm(places - volume.ijk_to_lps((np.array(volume.shape_ijk) - 1) / 2), axis=1)
-    assert radii == pytest.approx(SPHERE.radius_mm, abs=1.0)  # the centre of the phantom is off by part of a voxel
+    assert radii == pytest.approx(SPHERE.radius_mm, abs=1.0)  # mm: the centre is off by part of a voxel; measured 0.71
