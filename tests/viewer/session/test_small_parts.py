@@ -35,7 +35,7 @@ def specks(count: int) -> Volume:
     return Volume(voxels, np.eye(4))
 
 
-@pytest.mark.parametrize(("count", "is_said"), [(1_020, True), (1_019, False)], ids=["1000_small", "999_small"])
+@pytest.mark.parametrize(("count", "is_said"), [(20 + 1_000, True), (20 + 999, False)], ids=["1000_small", "999_small"])
 def test_a_thousand_parts_beside_the_twenty_largest_are_said_to_be_noise(open_session, count, is_said):
     view = open_session(specks(count))
 
