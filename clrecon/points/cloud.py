@@ -214,7 +214,7 @@ class PointCloud(Message, ShownAsHtml):
     def changed(self, **arrays: ArrayLike | None) -> PointCloud:
         """Return a cloud with other `points`, `normals`, `hu`, `labels`, `ijk` or ``report``; all else stays.
 
-        Points at other places have no `values`.
+        Points at other places have no ``values``.
         """
         known = ("points", "normals", "hu", "labels", "ijk", "report")
         unknown = arrays.keys() - set(known)

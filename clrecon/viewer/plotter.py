@@ -92,7 +92,7 @@ def show(
     Returns
     -------
     LivePage or None
-        The page has ``address``, `open` and `close`; see ``clrecon.viewer.notebook``.
+        The page has ``address``, ``open()`` and ``close()``; see ``clrecon.viewer.notebook``.
 
     Raises
     ------

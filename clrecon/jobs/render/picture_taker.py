@@ -13,9 +13,9 @@ from clrecon.labels.reader import read_all_labels
 from clrecon.rendering.looks.colors import is_transparent
 from clrecon.rendering.looks.presets import ALL_PRESETS, find_preset
 from clrecon.rendering.looks.transfer_files import load_transfer_function
-from clrecon.rendering.pictures.label_style import NO_LABEL
+from clrecon.rendering.pictures.label_style import NO_LABEL, list_legend
 from clrecon.rendering.pictures.object_looks import MESH_COLORS, MeshLook, PointLook
-from clrecon.rendering.pictures.sheets import add_scale
+from clrecon.rendering.pictures.sheets import add_legend, add_scale
 from clrecon.rendering.pictures.styles import SPINE, CurveCut, SlicesInSpace, Style, SurfaceLook, VolumeLook
 from clrecon.rendering.views.centre_line import read_curve_points
 from clrecon.rendering.views.clip import check_center
@@ -152,6 +152,9 @@ class PictureTaker(Closing):
             picture = self._open_volume().render(self.style, background=settings.background, **view)
         letters = settings.letters and not self.style.is_sheet  # each slice of a sheet has its own
         picture = picture.annotated(letters=letters, scale_bar=settings.scale_bar, caption=settings.caption)
+        look = getattr(self.style, "label_style", None)
+        if settings.legend and look is not None:
+            picture = add_legend(picture, list_legend(look))
         if not isinstance(self.style, MeshLook) or self.style.color_by is None:
             return picture
         scale, _ = self.style.find_scale(cast("Mesh", self._subject).values)

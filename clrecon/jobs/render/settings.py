@@ -214,6 +214,7 @@ class RenderSettings(InputSettings):
     )
     letters: bool = _camera_option("--letters", "draw the sides of the patient: L, R, A, P, S, I")
     scale_bar: bool = _camera_option("--scale-bar", "draw a bar of a round length in mm")
+    legend: bool = _camera_option("--legend", "draw the colours and names of the labels beside the picture")
     caption: str | None = _camera_option("--caption TEXT", "draw a line of text at the top left")
     turntable: Turntable | None = None
 
@@ -272,6 +273,10 @@ class RenderSettings(InputSettings):
         for name in ("letters", "zoom", "view_angle", "center", "turntable", "meshes"):
             if getattr(self, name) != _DEFAULTS[name]:
                 check_known(self.mode, name)
+        if self.legend and self.labels is None:
+            raise UsageError(
+                f"{name_parameter('legend')} names labels: give the label map with {name_parameter('labels')}"
+            )
         self._check_place()
         super().__post_init__()
 

@@ -178,6 +178,17 @@ def draw_labels(
     return drawn_image
 
 
+def list_legend(look: LabelStyle) -> list[tuple[str, str]]:
+    """Return the colour (#rrggbb) and name, as files can have it, of each label that is coloured and not hidden."""
+    numbers = [n for n in look.labels.numbers if look.table[n, 0] >= 0.0 and look.table[n, 3] > 0.0]
+    names = file_suffixes({n: look.labels.name(n) for n in numbers})
+    return [(_to_hexadecimal(look.table[n, :3]), names[n]) for n in numbers]
+
+
+def _to_hexadecimal(rgb: NDArray[np.float32]) -> str:
+    return "#" + "".join(f"{round(255 * float(share)):02x}" for share in rgb)
+
+
 def facts_of_overlay(numbers: NDArray[Any], look: LabelStyle) -> list[dict[str, Any]]:
     """Return number, name (one that files can have), colour and pixels of each label that is drawn."""
     counts = np.bincount(numbers.ravel(), minlength=len(look.table))
@@ -187,7 +198,7 @@ def facts_of_overlay(numbers: NDArray[Any], look: LabelStyle) -> list[dict[str, 
         {
             "label_number": int(n),
             "label": names[int(n)],
-            "color": "#" + "".join(f"{round(255 * float(share)):02x}" for share in look.table[n, :3]),
+            "color": _to_hexadecimal(look.table[n, :3]),
             "pixels": int(counts[n]),
         }
         for n in shown

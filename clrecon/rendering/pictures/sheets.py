@@ -212,3 +212,24 @@ def add_scale(picture: Rendering, scale: ColorScale, title: str) -> Rendering:
         tick_y = top + (scale.limit - tick) / (scale.limit - scale.low) * (bottom - 1 - top)
         pen.text((gap + bar + gap // 2, tick_y), name, "black", font, "lm")
     return replace(picture, image=np.concatenate([picture.image, np.array(strip)], axis=1))
+
+
+def add_legend(picture: Rendering, labels: Sequence[tuple[str, str]]) -> Rendering:
+    """Return an opaque picture with the colour (#rrggbb) and name of each label at its right, as many as fit."""
+    load_pillow()
+    from PIL import Image, ImageDraw
+
+    height = picture.image.shape[0]
+    text = max(_SMALLEST_TEXT, _TEXT_SHARE * height)
+    font = load_font(text)
+    gap, line = round(0.8 * text), round(1.5 * text)
+    room = max(1, (height - 2 * gap) // line)
+    shown = [*labels] if len(labels) <= room else [*labels[: room - 1], ("white", f"{len(labels) - room + 1:,} more")]
+    wide = 2 * gap + line + max((font.getlength(name) for _, name in shown), default=0.0)
+    strip = Image.new("RGBA", (round(wide), height), "white")
+    pen = ImageDraw.Draw(strip)
+    for row, (color, name) in enumerate(shown):
+        top = gap + row * line
+        pen.rectangle((gap, top, gap + text, top + text), fill=color)
+        pen.text((gap + line, top + text / 2), name, "black", font, "lm")
+    return replace(picture, image=np.concatenate([picture.image, np.array(strip)], axis=1))
