@@ -22,8 +22,8 @@ from clrecon.operators.masks.mask import Mask
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.operators.surface.extraction import keep_bricks
-from clrecon.operators.surface.growing import growing_needs
-from clrecon.operators.surface.seeds import AUTO_SHARE
+from clrecon.operators.surface.growing import FARTHEST_TOLD_MM, growing_needs
+from clrecon.operators.surface.seeds import AUTO_SHARE, SEED_REACH_MM
 from clrecon.operators.surface.slabs import SampleGrid
 from clrecon.proof.phantom import PhantomSettings, make_phantom
 from clrecon.proof.surface.extract import extract_isosurface as extract_twin
@@ -78,7 +78,7 @@ def test_surface_grown_in_random_voxels_equals_the_twin_at_sizes_of_words(
     shape: tuple[int, int, int], device: Any
 ) -> None:
     if np.prod(shape) > 10_000:
-        shape = (2, 2, shape[2])
+        shape = (2, 2, shape[2])  # the twin takes seconds for more; the size of words is that of a row
     assert_grown_surface_equals_twin(random_volume(shape, high=9), device, level=7)
 
 
@@ -312,24 +312,30 @@ def test_what_is_no_seed_is_refused(seeds: Any, words: str, device: Any) -> None
 
 @pytest.fixture
 def block_in_air() -> Volume:
-    """A block of 500 HU in voxels 4 to 8, in voxels of 1 mm."""
+    """A block of 500 HU from 4 to 8 along x and y and from 4 to 7 along z, in voxels of 1 mm."""
     voxels = np.full((12, 40, 90), -1000, np.int16)
     voxels[4:8, 4:9, 4:9] = 500
     return Volume(voxels, np.eye(4))
 
 
 def test_a_seed_in_air_is_refused_with_its_distance_from_the_surface(block_in_air: Volume, device: Any) -> None:
-    with refused(UsageError, 30, -1000, 21.5, 0):  # x of the seed, its HU, 30 - 8.5 mm, and the level
+    from_the_block = 30 - 8.5  # mm: the block ends half a voxel behind x = 8
+    with refused(UsageError, 30, -1000, from_the_block, 0):  # x of the seed, its HU, and the level
         extract_isosurface(block_in_air, 0, device=device, grow_from=(30, 6, 6))
 
 
 def test_a_seed_farther_from_the_surface_than_is_searched_is_refused(block_in_air: Volume, device: Any) -> None:
-    with refused(UsageError, 50, 0, 10):
-        extract_isosurface(block_in_air, 0, device=device, grow_from=(80, 6, 6))
+    x = 80
+    assert x - 8.5 > FARTHEST_TOLD_MM
+    with refused(UsageError, x, FARTHEST_TOLD_MM, SEED_REACH_MM):
+        extract_isosurface(block_in_air, 0, device=device, grow_from=(x, 6, 6))
 
 
-def test_a_seed_in_air_within_10_mm_grows_the_nearest_surface(block_in_air: Volume, device: Any) -> None:
-    grown = extract_isosurface(block_in_air, 0, device=device, grow_from=(16, 6, 6))
+def test_a_seed_in_air_grows_the_nearer_of_two_surfaces_within_10_mm(block_in_air: Volume, device: Any) -> None:
+    """The seed at x = 16 lies 7.5 mm from the block, which ends at 8.5, and 9.5 mm from another that begins at 25.5."""
+    two_blocks = block_in_air.voxels.copy()
+    two_blocks[4:8, 4:9, 26:31] = 500
+    grown = extract_isosurface(block_in_air.with_voxels(two_blocks), 0, device=device, grow_from=(16, 6, 6))
     assert_same(grown, extract_isosurface(block_in_air, 0, device=device))
 
 

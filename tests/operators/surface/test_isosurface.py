@@ -16,6 +16,7 @@ from clrecon.geometry import Volume, compose_affine, iso_rule
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface import marching_cubes
 from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurface, extract_isosurfaces
+from clrecon.operators.surface.marching_cubes import LONGEST_ROW
 from clrecon.proof.run import CHECKS, run_check
 from clrecon.proof.surface import extract as twin
 
@@ -237,9 +238,10 @@ def test_an_open_surface_of_one_slice_is_refused(device):
         extract_isosurface(random_volume((1, 4, 5)), 3, device=device, closed=False)
 
 
-def test_a_volume_of_too_many_columns_is_refused(device):
-    with refused(UsageError, 13_999, "columns"):
-        extract_isosurface(Volume(np.zeros((1, 1, 13_999), np.int8), np.eye(4)), 1, device=device)
+def test_a_volume_of_a_column_more_than_a_row_holds_is_refused_with_the_most(device):
+    most = LONGEST_ROW - 2  # with a sample outside of either end
+    with refused(UsageError, most + 1, most, "columns"):
+        extract_isosurface(Volume(np.zeros((1, 1, most + 1), np.int8), np.eye(4)), 1, device=device)
 
 
 def test_surface_of_an_array_is_refused(device):

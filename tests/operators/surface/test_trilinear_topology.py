@@ -14,6 +14,7 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Volume, compose_affine
 from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurface
+from clrecon.operators.surface.trilinear import LONGEST_ROW
 from clrecon.proof.surface import extract as twin
 from clrecon.proof.surface.trilinear_table import find_states
 
@@ -193,9 +194,10 @@ def test_an_unknown_topology_is_refused(device):
         extract_isosurface(random_volume((3, 3, 3)), 3, device=device, topology="manifold")
 
 
-def test_trilinear_topology_of_too_many_columns_is_refused_with_the_most(device):
-    wide = Volume(np.zeros((1, 2, 3000), np.int8), np.eye(4))
-    with refused(UsageError, 3000, 2968):  # of 2970 with one outside of either end
+def test_trilinear_topology_of_a_column_more_than_a_row_holds_is_refused_with_the_most(device):
+    most = LONGEST_ROW - 2  # with a sample outside of either end
+    wide = Volume(np.zeros((1, 2, most + 1), np.int8), np.eye(4))
+    with refused(UsageError, most + 1, most):
         extract_trilinear(wide, 1, device)
 
 
