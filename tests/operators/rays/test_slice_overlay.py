@@ -101,8 +101,10 @@ def test_marked_voxels_are_seen_alone_where_the_camera_projects_them(marked_voxe
     column, row = pixel.astype(int)
     assert found.image[row, column, 3] == round(0.7 * 255)
     assert found.depth[row, column] == pytest.approx(depth, abs=camera.pixel_mm(size))
-    seen = np.argwhere(found.image[..., 3] > 0)
-    assert np.abs(seen.mean(axis=0)[::-1] + 0.5 - pixel).max() < 1.0  # a patch around it, and nothing else
+    seen = np.argwhere(found.image[..., 3] > 0)[:, ::-1] + 0.5  # columns and rows
+    assert np.abs(seen.mean(axis=0) - pixel).max() < 1.0
+    to_a_corner_mm = 1.5 * np.hypot(*resident.volume.spacing[:2])  # of the 3 x 3 voxels
+    assert np.abs(seen - pixel).max() < to_a_corner_mm / camera.pixel_mm(size) + 1.0  # pixels: nothing else is seen
 
 
 def test_overlay_of_other_slices_than_that_of_marked_voxels_is_empty(marked_voxels):
@@ -160,7 +162,7 @@ def ten_slices():
     """A volume, a camera and settings of ten slices; bytes of the picture and of a slice."""
     volume = make_volume(blobs, "oblique", extent=26.0, dtype=np.int16)
     camera, size = look(volume, (0.4, 0.8, -0.7), half_height=14.0, perspective=True), (16, 12)
-    bytes_a_pixel = 44
+    bytes_a_pixel = 12 + 32  # of the picture, and of the state of its ray
     return volume, camera, size, list(range(0, 20, 2)), bytes_a_pixel * size[0] * size[1], volume.voxels[0].nbytes
 
 

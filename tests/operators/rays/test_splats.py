@@ -13,7 +13,15 @@ from variants import each_value
 import clrecon
 from clrecon.errors import DeviceError, UsageError
 from clrecon.operators.rays.picture_buffers import Shot
-from clrecon.operators.rays.point_pictures import LARGEST_DISC, MOST_NAMED, Discs, PointPictures, cloud_box, draw_splats
+from clrecon.operators.rays.point_pictures import (
+    LARGEST_DISC,
+    MOST_NAMED,
+    MOST_PIXELS,
+    Discs,
+    PointPictures,
+    cloud_box,
+    draw_splats,
+)
 from clrecon.points import PointCloud
 from clrecon.proof.rays.objects import find_splats, shade_splats
 from clrecon.rendering import UNSHADED, Lighting
@@ -80,6 +88,7 @@ def test_light_of_points_is_that_of_the_twin(device: Any, has_normals: bool, lig
     for camera in (CAMERAS["parallel"], CAMERAS["perspective"]):
         found = draw_splats(device, Discs(points, colors, own, radius_mm, lighting), Shot(camera, SIZE, "navy"))
         depth, numbers = find_splats(points, camera, SIZE, radius_mm)
+        # Neighbours of eye-dome lighting lie beyond a point's own disc, 1 to 8 pixels away.
         apart = int(np.clip(round(radius_mm / camera.pixel_mm(SIZE)), 1, 8))
         rgba, _ = shade_splats(depth, numbers, colors[:, :3] / 255.0, own, camera, lighting, apart)
         image = np.where(rgba[..., 3:] > 0.0, 255.0 * rgba[..., :3], (0.0, 0.0, 128.0))  # navy
@@ -156,14 +165,15 @@ def test_points_in_parts_give_the_same_picture_and_progress_after_each(device: A
     discs, shot = many_discs
     whole = draw_splats(device, discs, shot)
     calls: list[tuple[str, int, int]] = []
-    memory = PICTURE_BYTES + POINT_BYTES * 80_000
+    part = 80_000
+    memory = PICTURE_BYTES + POINT_BYTES * part
     parts = draw_splats(device, discs, shot._replace(progress=lambda *call: calls.append(call)), memory=memory)
     assert (whole.parts, parts.parts) == (1, 4)
     assert parts.image.tobytes() == whole.image.tobytes()
     assert parts.depth.tobytes() == whole.depth.tobytes()
-    passes = 3
-    assert calls[0] == ("points", 0, passes * MANY)
-    assert calls[-1] == ("points", passes * MANY, passes * MANY)
+    passes, ends = 3, [part, 2 * part, 3 * part, MANY]
+    done = [0, *(MANY * number + end for number in range(passes) for end in ends)]
+    assert calls == [("points", count, passes * MANY) for count in done]
 
 
 def test_permuted_points_give_the_same_picture(device: Any, many_discs: Any) -> None:
@@ -327,7 +337,8 @@ def test_discs_of_few_points_larger_than_are_drawn_are_warned_of(device: Any) ->
     assert f"are drawn with {LARGEST_DISC:g}" in near.report["warnings"][-1]  # pixels
 
 
-def test_large_discs_of_many_points_are_refused(device: Any) -> None:
-    many = PointCloud(*ball(1_400_000))
-    with refused(UsageError, "radius", "zoom", 1_400_000):
+def test_large_discs_of_a_few_points_more_than_are_drawn_are_refused(device: Any) -> None:
+    too_many = int(MOST_PIXELS / (np.pi * LARGEST_DISC**2)) + 1  # their discs have more pixels than the most
+    many = PointCloud(*ball(too_many))
+    with refused(UsageError, "radius", "zoom", too_many):
         clrecon.render(many, camera=FRONT, size=(64, 64), radius_mm=80.0, device=device)

@@ -49,13 +49,13 @@ def assert_equal(found, expected, work: str) -> None:
 
 
 @pytest.mark.parametrize(("work", "kind"), daily_rows(6, each_value(WORK, ["buffer", "launch"])))
-def test_result_is_the_same_whichever_buffer_or_launch_fails(device, volume, labels, monkeypatch, work, kind):
+def test_result_is_the_same_after_a_buffer_or_launch_failed_at_several_places(device, volume, labels, monkeypatch, work, kind):
     with monkeypatch.context() as patch, DeviceVolume(volume, device=device) as resident:
         counted = Failing(patch, kind, 0)
         expected = WORK[work](resident, labels)
     count = counted.counts[kind]
     assert count > 0
-    for fails in range(1, count + 1, max(1, count // 6)):
+    for fails in range(1, count + 1, max(1, count // 6)):  # each of fewer than 12, and at least six of more
         with monkeypatch.context() as patch, DeviceVolume(volume, device=device) as resident:
             failing = Failing(patch, kind, fails)
             found = WORK[work](resident, labels)
@@ -88,7 +88,7 @@ def test_a_device_without_any_room_is_refused_and_holds_nothing(device, volume, 
         assert resident.uploaded_bytes == 0
 
 
-def test_a_mesh_a_rendering_and_three_slices_upload_the_volume_once(device, volume):
+def test_a_mesh_a_rendering_three_slices_a_curved_one_and_slices_in_space_upload_the_volume_once(device, volume):
     with DeviceVolume(volume, device=device) as resident:
         clrecon.extract_isosurface(resident, 100)
         clrecon.render(resident, preset="muscle", size=SIZE)

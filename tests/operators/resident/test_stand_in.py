@@ -41,7 +41,7 @@ def gpu(device):
 
 @pytest.mark.fault_row(54)
 @pytest.mark.parametrize(("work", "kind"), daily_rows(3, each_value(WORK, ["launch", "buffer"])))
-def test_the_cpu_device_takes_over_from_any_buffer_or_launch_on_with_the_same_result(
+def test_the_cpu_device_takes_over_from_a_failed_buffer_or_launch_on_with_the_same_result(
     device, gpu, volume, labels, monkeypatch, work, kind
 ):
     with DeviceVolume(volume, device=device) as resident:
@@ -52,7 +52,8 @@ def test_the_cpu_device_takes_over_from_any_buffer_or_launch_on_with_the_same_re
         assert resident.device is gpu
     count = counted.counts[kind]
     assert count > 0
-    firsts = {count // 2 + 1} if kind == "launch" else {1, count // 2 + 1, count}
+    middle = count // 2 + 1
+    firsts = {middle} if kind == "launch" else {1, middle, count}
     for first in sorted(firsts):
         gpu = pretended_gpu(device)
         with monkeypatch.context() as patch, DeviceVolume(volume, device=gpu) as resident:
@@ -128,10 +129,11 @@ def test_a_device_that_the_user_named_fails_and_names_the_cpu_device(device, gpu
 
 
 @pytest.mark.fault_row(54)
-def test_a_cpu_device_never_hands_over(device, volume, monkeypatch):
+def test_a_cpu_device_without_room_fails_and_hands_nothing_over(device, volume, monkeypatch):
     Failing(monkeypatch, "buffer", first=1, last=NEVER_LAST)
     with refused(DeviceMemoryError, "injected"):
         clrecon.extract_isosurface(volume, 100, device=device)
+    assert device.handed_over == []
 
 
 @pytest.fixture
