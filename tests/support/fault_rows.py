@@ -221,7 +221,9 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     ),
     54: (
         "an allocation or launch that fails late: halved, tried again, then the CPU, told",
-        ("operators/resident/test_device_volume.py::test_result_is_the_same_after_a_buffer_or_launch_failed_at_several_places",),
+        (
+            "operators/resident/test_device_volume.py::test_result_is_the_same_after_a_buffer_or_launch_failed_at_several_places",
+        ),
     ),
     55: (
         "2^31 triangles, counters that wrap: 64-bit counts, refused by budget",

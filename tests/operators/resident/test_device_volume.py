@@ -49,7 +49,9 @@ def assert_equal(found, expected, work: str) -> None:
 
 
 @pytest.mark.parametrize(("work", "kind"), daily_rows(6, each_value(WORK, ["buffer", "launch"])))
-def test_result_is_the_same_after_a_buffer_or_launch_failed_at_several_places(device, volume, labels, monkeypatch, work, kind):
+def test_result_is_the_same_after_a_buffer_or_launch_failed_at_several_places(
+    device, volume, labels, monkeypatch, work, kind
+):
     with monkeypatch.context() as patch, DeviceVolume(volume, device=device) as resident:
         counted = Failing(patch, kind, 0)
         expected = WORK[work](resident, labels)

@@ -189,7 +189,7 @@ def test_vertices_at_a_golden_section_of_each_edge_fail_the_bar_of_a_partial_vol
     """As a paper has it: at a constant 0.618 of an edge they are no better than a binary mask."""
     radius = 6.4
     axis = np.arange(-9.0, 10.0)
-    z, y, x = np.meshgrid(axis - 0.23, axis + 0.17, axis - 0.31, indexing="ij")
+    z, y, x = np.meshgrid(*(axis - c for c in CENTER[::-1]), indexing="ij")
     inside = np.sqrt(x * x + y * y + z * z) < radius
     golden = 0.5 * (np.sqrt(5.0) - 1.0)
     crossed = np.argwhere(inside[:, :, :-1] != inside[:, :, 1:])

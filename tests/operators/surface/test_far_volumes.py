@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 import tolerances
@@ -93,8 +95,8 @@ STEP_BOUND_MM = 2.5e-4
 
 
 def volume_that_reaches(height: float) -> Volume:
-    """The sphere, shifted along z so that its volume with a voxel around it ends there at most."""
-    reach = np.abs(make_sphere().ijk_to_lps([(-1, -1, -1), (50, 40, 30)])).max()
+    """The sphere, shifted along z so that the volume with a voxel around it ends at this height, mm."""
+    reach = make_sphere().ijk_to_lps(list(itertools.product((-1, 50), (-1, 40), (-1, 30))))[:, 2].max()
     return make_sphere((0.0, 0.0, height - reach))
 
 
@@ -102,14 +104,18 @@ def test_volumes_are_far_from_where_steps_of_float32_pass_their_bound():
     assert float32_step(FAR_MM - 1.0) < STEP_BOUND_MM < float32_step(FAR_MM)
 
 
+@pytest.mark.parametrize(("more_mm", "has_origin"), [(-0.01, False), (0.01, True)], ids=["below", "beyond"])
+def test_vertices_count_from_an_origin_near_a_volume_that_reaches_beyond_the_bound(more_mm, has_origin):
+    assert (find_vertex_origin(volume_that_reaches(FAR_MM + more_mm)) is not None) == has_origin
+
+
 def test_vertices_of_a_volume_below_the_bound_are_float32(device):
-    below = volume_that_reaches(FAR_MM - 40.0)
-    assert find_vertex_origin(below) is None
+    below = volume_that_reaches(FAR_MM - 0.01)
     assert extract_isosurface(below, 0.5, device=device).vertices.dtype == np.float32
 
 
 def test_vertices_of_a_volume_beyond_the_bound_are_float64_from_an_origin_of_whole_millimetres(device):
-    beyond = make_sphere((0.0, 0.0, FAR_MM))
+    beyond = make_sphere((0.0, 0.0, FAR_MM))  # the sphere too lies beyond, not its volume alone
     origin = find_vertex_origin(beyond)
     assert np.array_equal(origin, np.rint(origin))  # adding it is exact to 1e-11 mm
     assert extract_isosurface(beyond, 0.5, device=device).vertices.dtype == np.float64
@@ -137,10 +143,10 @@ def test_a_far_mesh_has_the_measures_of_a_near_one(near_and_far, change):
     assert np.abs(np.subtract(found["bounds_mm"], expected["bounds_mm"]) - FAR).max() < 2e-6  # mm; measured 7e-7
 
 
-def test_smoothing_moves_a_far_mesh_by_half_a_quarter_of_a_voxel_at_most(near_and_far):
+def test_smoothing_moves_a_far_mesh_by_a_quarter_of_its_shortest_voxel_step_at_most(near_and_far):
     _, far = near_and_far
     distances = clrecon.compare_meshes(clrecon.smooth_mesh(far), far)
-    assert 0.0 < distances["max_mm"] <= 0.25 * 0.51  # pixels of 0.5 mm, sheared
+    assert 0.0 < distances["max_mm"] <= 0.25 * min(make_sphere(FAR).spacing)  # measured 0.04 of 0.126 mm
 
 
 # --- files ---

@@ -16,15 +16,6 @@ from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.operators.surface.methods import METHODS, check_method, extract_by_method
 
 
-def sorted_corners(mesh: Any) -> np.ndarray:
-    """Triangles as their places, each beginning with its lowest, in one order."""
-    corners = mesh.vertices[mesh.triangles].astype(np.float64)
-    first = np.lexsort(corners.transpose(2, 0, 1), axis=1)[:, 0]
-    turned = (first[:, None] + np.arange(3)) % 3
-    flat = np.take_along_axis(corners, turned[..., None], axis=1).reshape(len(corners), 9)
-    return flat[np.lexsort(np.round(flat, 2).T)]
-
-
 @pytest.fixture(params=[OBLIQUE, MIRRORED], ids=["oblique", "mirrored"])
 def smooth_field(request: pytest.FixtureRequest) -> Any:
     return smooth_volume((9, 10, 24), affine=request.param)
@@ -118,6 +109,6 @@ def test_share_of_triangles_is_refused_by_a_method_that_does_not_decimate() -> N
 
 
 @pytest.mark.parametrize("method", ["t-mc-soup", "skimage"])
-def test_level_above_all_voxels_has_no_surface_by_any_method(method: str) -> None:
+def test_level_above_all_voxels_has_no_surface_by_a_method_of_the_host(method: str) -> None:
     with refused(NoSurfaceError, 9000, "surface"):
         extract_by_method(smooth_volume((4, 5, 6)), 9000, method)

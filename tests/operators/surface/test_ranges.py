@@ -153,7 +153,7 @@ def test_surface_below_a_level_of_an_empty_volume_ends_half_a_voxel_beyond_it(de
 @pytest.mark.parametrize(("level", "options"), [((2, 3), {}), (3, {"below": True})], ids=["range", "below"])
 @pytest.mark.parametrize("dtype", ["int16", "uint8", "float32"])
 @pytest.mark.parametrize("slices", [1, 2, 3, 5])
-def test_slabs_of_any_thickness_give_the_same_surface_of_a_range(device, dtype, level, options, slices):
+def test_slabs_of_one_to_five_slices_give_the_same_surface_of_a_range(device, dtype, level, options, slices):
     volume = random_volume((9, 7, 40), dtype=dtype, affine=MIRRORED if dtype == "uint8" else OBLIQUE)
     mesh = extract_in_slabs(volume, level, device, slices=slices, **options)
     assert mesh.report["slabs"] == -(-(9 + 2) // slices)  # with a border at both ends
@@ -170,7 +170,7 @@ def test_surface_of_a_range_in_uneven_slices_equals_the_twin(device, level, opti
     assert_equals_twin(volume, level, device, **options)
 
 
-def test_surfaces_of_a_resident_volume_are_those_of_the_volume_in_any_order(device):
+def test_surfaces_of_a_resident_volume_by_level_range_and_below_in_turn_are_those_of_the_volume(device):
     volume = smooth_volume()
     asked = [(100, {}), ((-50, 120), {}), (-50, {"below": True}), (100, {}), ((-50, 120), {})]
     with SurfaceExtractor(volume, device=device) as extractor:
