@@ -110,7 +110,7 @@ def clusters_of(*parts: np.ndarray) -> PointCloud:
     ],
     ids=["17 times as wide as thick", "9 times as wide as thick", "480 points", "block"],
 )
-def test_a_sheet_is_many_times_as_wide_as_thick_and_has_500_points(points: np.ndarray, is_sheet: bool) -> None:
+def test_a_sheet_is_more_than_15_times_as_wide_as_thick_and_has_500_points(points: np.ndarray, is_sheet: bool) -> None:
     assert measure_clusters(clusters_of(points)).sheets.tolist() == [is_sheet]
 
 

@@ -144,7 +144,7 @@ def test_arrays_of_an_npz_that_are_no_points_are_refused(points, tmp_path):
 @pytest.mark.parametrize("mode", ["Ascii", "Binary", "Appended"])
 @pytest.mark.parametrize("packing", ["None", "ZLib"])
 @pytest.mark.parametrize("base64", [True, False])
-def test_vtp_cloud_in_every_encoding_of_vtk_is_read(mode, packing, base64, tmp_path):
+def test_vtp_cloud_in_text_or_binary_data_as_it_is_or_packed_by_zlib_is_read(mode, packing, base64, tmp_path):
     pyvista = pytest.importorskip("pyvista")
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 

@@ -77,12 +77,13 @@ class Failing:
 class BurntDevice:
     """A device whose queue cannot be opened."""
 
-    def __init__(self, device: Device) -> None:
+    def __init__(self, device: Device, reason: str = "it caught fire") -> None:
         self._device = device
+        self._reason = reason
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._device, name)
 
     @property
     def queue(self) -> Any:
-        raise DeviceError("it caught fire")
+        raise DeviceError(self._reason)

@@ -199,7 +199,7 @@ def test_cortex_fitted_in_slabs_is_that_of_the_whole(device, uneven, few, cubic)
         mesh.vertex_count > 4 * cortex.SMALLEST_PIECE
     )  # so that few places at a time are several pieces; measured 3538
     places = cortex.SMALLEST_PIECE if few else cortex.stride_of(mesh.vertex_count)
-    place_bytes = 140
+    place_bytes = 4 * (cortex.ROWS + cortex.RESULTS) + 32  # what each profile takes on the device
     memory = volume.voxels.nbytes // 2 + place_bytes * places
 
     with DeviceVolume(volume, device=device, memory=memory) as resident:

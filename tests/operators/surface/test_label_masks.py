@@ -477,7 +477,7 @@ def test_labels_that_do_not_fit_alone_are_refused(device):
 
 @pytest.mark.release
 @pytest.mark.parametrize(("lanes", "words"), daily_rows(1, [("1", "1"), ("8", "3")]))
-def test_every_variant_of_the_kernels_gives_the_same_meshes(device, lanes, words, monkeypatch):
+def test_kernels_of_gpus_and_those_of_three_words_an_item_give_the_same_meshes(device, lanes, words, monkeypatch):
     labels = random_labels((6, 7, 75), numbers=(0, 0, 3, 7)).astype(np.uint8)
     expected = extract_label_masks(LabelMap(labels, MIRRORED), device=device)
     variants = {**device.kernel_variants, "LANES": lanes, "WORDS_PER_ITEM": words}

@@ -79,7 +79,9 @@ def test_surfaces_of_labels_equal_their_twin_for_every_voxel_type(device, dtype,
 @pytest.mark.release
 @pytest.mark.parametrize(("lanes", "words"), [("1", "1"), ("8", "3")])
 @pytest.mark.parametrize("numbers", daily(1, [(0, 0, 3, 7), (0, 0, 3, 300)]), ids=["one-byte", "two-bytes"])
-def test_every_variant_of_the_kernels_gives_the_same_meshes(device, lanes, words, numbers, monkeypatch):
+def test_kernels_of_gpus_and_those_of_three_words_an_item_give_the_same_meshes(
+    device, lanes, words, numbers, monkeypatch
+):
     volume, labels = random_volume((6, 7, 75), affine=MIRRORED), random_labels((6, 7, 75), numbers=numbers)
     inside = twin.find_solid(volume, labels, 3)
     variants = {**device.kernel_variants, "LANES": lanes, "WORDS_PER_ITEM": words}

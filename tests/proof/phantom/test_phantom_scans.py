@@ -83,7 +83,7 @@ def test_scan_of_a_scanner_that_pads_has_its_padding_outside_of_the_disc_alone(
     padding = KINDS[kind].scanner.padding
     outside = outside_disc(voxels.shape[1:], affine) & (padding is not None)
     assert (voxels[:, outside] == padding).all()
-    corners = 1.0 - np.pi / 4.0 * 0.985**2  # of a square around a disc that ends a little within it
+    corners = 1.0 - np.pi / 4.0 * 0.985**2  # of a square: the disc has 0.985 of its width, as sampling.py draws it
     assert outside.mean() == pytest.approx(0.0 if padding is None else corners, abs=0.005)  # pixels at the rim
 
 

@@ -164,6 +164,7 @@ def test_voxels_between_muscle_and_cortex_have_many_values_of_partial_volume() -
 def test_bone_of_a_vertebra_surrounds_its_canal_and_leaves_it_free(name: str) -> None:
     anatomy = plan_anatomy(field_of_view_mm=(250.0, 250.0, 150.0), steps_mm=np.eye(3), seed=1)
     [vertebra] = [each for each in anatomy.vertebrae if each.name == name]
+    # 0.8 mm of the canal lie in the hollow at the back of the body.
     middle_of_canal = vertebra.depth / 2.0 + vertebra.canal_half_depth - 0.8
     angles = np.linspace(0.0, 2.0 * np.pi, 73)[None, :]
     reach_mm = np.linspace(0.0, 30.0, 301)[:, None]
@@ -209,5 +210,5 @@ def test_spine_has_all_ribs_but_the_left_twelfth(whole_spine: Anatomy) -> None:
 
 def test_levels_of_a_straight_spine_lie_near_the_middle_plane(whole_spine: Anatomy) -> None:
     x = np.array([vertebra.center[0] for vertebra in whole_spine.vertebrae])
-    middle_x = 1.7  # mm, of the planned spine
+    middle_x = 1.7  # mm: where spine_parts.py places the spine
     assert np.abs(x - middle_x).max() < 3.0  # mm; measured 1.4
