@@ -145,7 +145,7 @@ def test_surfaces_of_a_real_scan_have_the_dice_of_the_documents(
         extract_isosurface(volume, 200, device=device),
     )
     slices = measure_slices(mesh, volume, 200)
-    assert slices.dice == pytest.approx(fine_dice, abs=0.0016)  # written with three decimals
-    assert measure_cells(mesh, linear, volume).dice == pytest.approx(cells_dice, abs=0.0016)
+    assert slices.dice == pytest.approx(fine_dice, abs=0.001)  # written with three decimals; measured 0.0003 off
+    assert measure_cells(mesh, linear, volume).dice == pytest.approx(cells_dice, abs=0.001)  # measured 0.0004 off
     if method == "t-mc":
         assert slices.voxel_dice == 1.0
