@@ -89,7 +89,8 @@ def open_airway():
 
 def test_an_airway_that_is_open_to_the_outside_is_cut_at_its_mouth(open_airway):
     below = open_airway.voxels < LEVEL_HU
-    cavity, middle_of_tube, before_its_mouth = np.s_[:, ellipse(0, 0, 29, 11)], np.s_[6, 60, 100], np.s_[6, :15]
+    cavity = np.s_[:, ellipse(0, 0, 29, 11)]
+    middle_of_tube, before_its_mouth = np.s_[6, 60, 100], np.s_[6, :15]  # slice, row and column; rows of air
     assert below[cavity].all()
     assert below[middle_of_tube]
     assert not below[before_its_mouth].any()

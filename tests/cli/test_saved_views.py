@@ -96,7 +96,7 @@ def test_render_with_a_saved_view_refuses_what_the_view_says_itself(
 
 
 @pytest.mark.opencl
-def test_view_opened_with_a_saved_view_shows_its_parts_and_saves_the_same_again(
+def test_view_opened_with_a_saved_view_saves_the_same_again(
     device: Any, scan: Path, saved: Path, tmp_path: Path
 ) -> None:
     with open_scan(scan, device, saved / "shown.view.json") as view, view.session() as session:

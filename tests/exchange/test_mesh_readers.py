@@ -164,7 +164,7 @@ def test_lines_of_an_obj_are_left_out_with_a_warning(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("mode", ["ascii", "binary", "appended", "zlib", "base64"])
-def test_vtp_in_every_encoding_of_vtk_is_read(tmp_path: Path, mode: str) -> None:
+def test_vtp_of_vtk_is_read_as_text_binary_appended_packed_by_zlib_and_in_base64(tmp_path: Path, mode: str) -> None:
     pyvista = pytest.importorskip("pyvista")
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 

@@ -68,7 +68,7 @@ def test_coded_surface_has_the_vertices_that_triangles_use_in_the_order_of_first
     assert (numbers <= highest_before + 1).all()  # a new vertex is always the next one
 
 
-def test_coded_surface_of_one_flat_triangle_comes_back_exactly():
+def test_coded_surface_of_one_flat_triangle_comes_back_as_its_corners_are_whole_steps():
     vertices = np.array([[0.0, 0.0, 7.0], [30.0, 0.0, 7.0], [0.0, 40.0, 7.0]])
     down = np.tile(np.float32([0, 0, -1]), (3, 1))
     coded = encode_surface(vertices, down, np.array([[2, 0, 1]], np.uint32))
