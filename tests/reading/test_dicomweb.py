@@ -423,21 +423,21 @@ def test_redirection_back_from_another_host_stays_without_credentials(
 
 
 @pytest.mark.parametrize(
-    ("location", "kind", "host"),
+    ("location", "kind", "facts"),
     [
-        ("file:///etc/passwd", RefusedInputError, "127.0.0.1"),
-        ("ftp://127.0.0.1/a", RefusedInputError, "127.0.0.1"),
-        ("http://pacs.example/a", UsageError, "pacs.example"),
-        ("http://[", RefusedInputError, "127.0.0.1"),
-        ("", RefusedInputError, "127.0.0.1"),
+        ("file:///etc/passwd", RefusedInputError, ("127.0.0.1", "redirects")),
+        ("ftp://127.0.0.1/a", RefusedInputError, ("127.0.0.1", "redirects")),
+        ("http://pacs.example/a", UsageError, ("pacs.example",)),
+        ("http://[", RefusedInputError, ("127.0.0.1", "redirects")),
+        ("", RefusedInputError, ("127.0.0.1", "redirects")),
     ],
 )
 def test_redirection_to_another_scheme_a_host_in_the_clear_or_no_address_is_refused(
-    location: str, kind: type[ClreconError], host: str, archive: Archive
+    location: str, kind: type[ClreconError], facts: tuple[str, ...], archive: Archive
 ) -> None:
     archive.answers = [answering(status=302, Location=location)]
 
-    with refused(kind, host):
+    with refused(kind, *facts):
         read_volume(archive.url)
 
 

@@ -249,7 +249,7 @@ def test_object_that_ends_early_is_refused_with_both_sizes(bucket: BucketServer)
 def test_object_whose_name_leads_out_of_the_folder_is_refused(name: str, bucket: BucketServer) -> None:
     bucket.objects = {f"p/{name}": b"x"}
 
-    with refused(RefusedInputError, "s3://scans/p"):
+    with refused(RefusedInputError, "s3://scans/p", "path", "out"):
         read_volume("s3://scans/p/")
 
 

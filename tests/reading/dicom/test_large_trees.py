@@ -155,7 +155,7 @@ def test_series_with_a_file_whose_disk_does_not_answer_is_refused_by_its_name(
     monkeypatch.setattr(disk, "read_start", hang)
     calls: list[tuple[str, int, int]] = []
     try:
-        with refused(RefusedInputError, "slice003.dcm"):
+        with refused(RefusedInputError, "slice003.dcm", "disk"):
             read_volume(tmp_path, progress=lambda *call: calls.append(call))
     finally:
         answer.set()
@@ -227,7 +227,7 @@ def test_series_with_a_file_that_vanishes_is_refused_by_its_name(
         return read_start(file, limit)
 
     monkeypatch.setattr(disk, "read_start", vanish)
-    with refused(RefusedInputError, "slice006.dcm"):
+    with refused(RefusedInputError, "slice006.dcm", "readable"):
         read_volume(tmp_path)
 
 

@@ -182,7 +182,7 @@ def test_writing_an_array_as_a_volume_is_refused(tmp_path):
 
 
 def test_writing_a_volume_into_no_folder_is_refused(tmp_path):
-    with refused(OutputError, "a.nii"):
+    with refused(OutputError, "a.nii", "folder"):
         write_volume(Volume(np.zeros((2, 2, 2), np.int16), np.eye(4)), tmp_path / "none" / "a.nii")
 
 

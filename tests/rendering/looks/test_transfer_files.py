@@ -283,7 +283,7 @@ def test_file_that_is_no_transfer_function_is_refused(
 
 
 def test_missing_transfer_file_is_refused(tmp_path: Path) -> None:
-    with refused(UsageError, "gone.json"):
+    with refused(UsageError, "no", "file", "gone.json"):
         load_transfer_function(tmp_path / "gone.json")
 
 
