@@ -34,7 +34,7 @@ from clrecon.operators.surface.cortex import (
 from clrecon.operators.surface.cortex_constants import find_groups, measure_constants
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.light_dataclass import dataclass
-from clrecon.system.pieces import in_threads, spread_rows
+from clrecon.system.pieces import chunks, in_threads, spread_rows
 from clrecon.system.progress import Progress, Steps, ignore_progress
 from clrecon.system.records import Record
 
@@ -155,31 +155,31 @@ def fit_walls(
     levels = tuple(known.cortex_hu for _, known in groups[1:])
     marks = np.empty(count, np.uint8), np.empty(count, bool)
     fit = CortexFit(constants, levels, *marks, *(np.empty(count, np.float32) for _ in range(5)))
-    steep = np.square(normals @ sampler.frame.normal)
     if cubic:
         sampler = ProfileSampler(resident, stopwatch, cubic=True)
     for members, known in groups:
+        within, across = known.blur_mm**2, known.blur_across_mm**2
         for piece, values_d in sampler.pieces(points[members], normals[members]):
-            rows = members[piece]
             with stopwatch.running(resident.device):
-                profiles = WallProfiles(sampler, values_d, len(rows))
-                walls, frames = profiles.fit_with(known), profiles.frames()
+                profiles = WallProfiles(sampler, values_d, len(piece))
+                fits, frames = profiles.fit_with(known), profiles.frames()
                 denser = None if known.denser is None else profiles.fit_with(known.at_dense_end()).shift_mm
-            within, across = known.blur_mm**2, known.blur_across_mm**2
-            blurs = np.sqrt(within + (across - within) * steep[rows])
-            hidden = (blurs > _ACROSS * known.blur_mm) & (walls.thickness_mm < _HIDDEN_BLURS * blurs)
-            fit.states[rows] = judge_walls(walls, known, sampler.scale, hidden)
-            fit.hidden[rows] = hidden & (fit.states[rows] == _BADLY_FITTED)
-            is_solid, depth_mm = walls.inner_hu > _SOLID_SHARE * walls.cortex_hu, np.float32(-sampler.scale.first_mm)
-            fit.thickness_mm[rows] = np.maximum(walls.thickness_mm, np.where(is_solid, depth_mm, np.float32(0.0)))
-            fit.shift_mm[rows] = walls.shift_mm
-            fit.room_mm[rows] = walls.room_mm
-            fit.spread_mm[rows] = standard_errors(walls, known)
-            steps = sampler.frame.steps_along(normals[rows], frames[1])
-            ratios = steps / blurs_of(frames, known.blur_mm, known.blur_across_mm)
-            fit.error_mm[rows] = standard_errors(walls, known, coarse_mm=steps * ratios * ratios)
-            if denser is not None:
-                fit.error_mm[rows] = np.hypot(fit.error_mm[rows], _DENSER_ERROR * (denser - walls.shift_mm))
+            for span in chunks(len(piece)):  # products of more rows keep threads of BLAS busy with waiting
+                rows, walls = members[piece[span]], WallFits(*(row[span] for row in fits.rows()))
+                blurs = np.sqrt(within + (across - within) * np.square(normals[rows] @ sampler.frame.normal))
+                hidden = (blurs > _ACROSS * known.blur_mm) & (walls.thickness_mm < _HIDDEN_BLURS * blurs)
+                fit.states[rows] = judge_walls(walls, known, sampler.scale, hidden)
+                fit.hidden[rows] = hidden & (fit.states[rows] == _BADLY_FITTED)
+                is_solid = walls.inner_hu > _SOLID_SHARE * walls.cortex_hu
+                depth_mm = np.float32(-sampler.scale.first_mm)
+                fit.thickness_mm[rows] = np.maximum(walls.thickness_mm, np.where(is_solid, depth_mm, np.float32(0.0)))
+                fit.shift_mm[rows], fit.room_mm[rows] = walls.shift_mm, walls.room_mm
+                fit.spread_mm[rows] = standard_errors(walls, known)
+                steps = sampler.frame.steps_along(normals[rows], frames[1, span])
+                ratios = steps / blurs_of(frames[:, span], known.blur_mm, known.blur_across_mm)
+                fit.error_mm[rows] = standard_errors(walls, known, coarse_mm=steps * ratios * ratios)
+                if denser is not None:
+                    fit.error_mm[rows] = np.hypot(fit.error_mm[rows], _DENSER_ERROR * (denser[span] - walls.shift_mm))
     return fit
 
 
@@ -274,9 +274,8 @@ class CortexReport(Record):
 def doubt_lone_vertices(fit: CortexFit, triangles: NDArray[np.uint32], fans: Fans) -> None:
     """Call vertices that are no bone badly fitted, in place, where `_LONE_SHARE` of those around them are fitted."""
     rows = np.flatnonzero(fit.states == NOT_BONE)
-    counts = fans.sums(np.column_stack([fit.states == FITTED, np.ones(len(fit.states))]), triangles, rows)
-    around = counts[:, 1] - (fans.begin[rows + 1] - fans.begin[rows])
-    fit.states[rows[counts[:, 0] >= _LONE_SHARE * around]] = _BADLY_FITTED
+    counts = fans.sums((fit.states == FITTED).astype(np.float32)[:, None], triangles, rows)[:, 0]
+    fit.states[rows[counts >= 2.0 * _LONE_SHARE * (fans.begin[rows + 1] - fans.begin[rows])]] = _BADLY_FITTED
 
 
 def choose_shifts(fit: CortexFit, triangles: NDArray[np.uint32], fans: Fans) -> NDArray[np.float32]:
