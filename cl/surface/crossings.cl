@@ -57,6 +57,14 @@ static inline points spread(const float3 p)
     return found;
 }
 
+/* Three rows of coordinates; a loop over all nine went by way of memory. */
+static inline points points_at(__global const float *rows, const uint stride, const uint place)
+{
+    const points found = {load_lanes(rows + place), load_lanes(rows + (size_t)stride + place),
+        load_lanes(rows + 2 * (size_t)stride + place)};
+    return found;
+}
+
 static inline points away(const points p, const points q)
 {
     const points found = {p.x - q.x, p.y - q.y, p.z - q.z};
@@ -202,10 +210,8 @@ static inline ints not_apart(
     __global const float *places, __global const uint *names, const uint stride, const uint place,
     const ints counts, const triangle *own, const plane *flat, const float3 begin, const float3 end)
 {
-    floats at[9];
-    for (int n = 0; n < 9; ++n)
-        at[n] = load_lanes(places + (size_t)n * stride + place);
-    const points d = {at[0], at[1], at[2]}, e = {at[3], at[4], at[5]}, f = {at[6], at[7], at[8]};
+    const points d = points_at(places, stride, place), e = points_at(places + 3 * (size_t)stride, stride, place);
+    const points f = points_at(places + 6 * (size_t)stride, stride, place);
     ints left = counts & (greater(greater(d.x, e.x), f.x) >= begin.x) & (lesser(lesser(d.x, e.x), f.x) <= end.x);
     left &= (greater(greater(d.y, e.y), f.y) >= begin.y) & (lesser(lesser(d.y, e.y), f.y) <= end.y);
     left &= (greater(greater(d.z, e.z), f.z) >= begin.z) & (lesser(lesser(d.z, e.z), f.z) <= end.z);
