@@ -187,9 +187,13 @@ def test_slice_of_a_crop_is_drawn(scan: Path, tmp_path: Path) -> None:
     assert (tmp_path / "p.png").exists()
 
 
-def test_iso_value_of_a_slice_is_refused_with_a_crop(scan: Path, tmp_path: Path) -> None:
-    words = ["--mode", "slice", "--between", "110,130", "--iso", "300", "-q"]
-    assert run("render", scan, "-o", tmp_path / "p.png", *words) == 3
+def test_iso_value_of_a_cropped_slice_is_refused_as_that_of_a_whole_one(
+    scan: Path, tmp_path: Path, printed: Any
+) -> None:
+    words = ["render", scan, "-o", tmp_path / "p.png", "--mode", "slice", "--iso", "300", "-q"]
+    for crop in ([], ["--between", "110,130"]):
+        assert run(*words, *crop) == 3
+        printed().assert_error("--iso", "slice")
 
 
 @pytest.mark.parametrize(

@@ -182,7 +182,8 @@ def test_largest_component_without_the_table_is_bone(odd: OddBodies, device: Any
     body = odd[name]
     report, vertices = mesh_of(odd, device, tmp_path, name, iso_value=300.0, remove_table=True, keep_largest=1)
     assert report["components_kept"] == 1 <= report["components_found"]
-    assert share_near(body, vertices, "bone", "metal", "contrast") > 0.97  # measured from 0.988 on
+    # A prosthesis is in one piece with the pelvis: measured from 0.988 on, 0.908 there without it.
+    assert share_near(body, vertices, "bone", "metal") > 0.97
 
 
 @pytest.mark.parametrize("name", daily(3, BONY))
@@ -197,7 +198,8 @@ def test_seed_in_bone_keeps_one_component_of_bone_about_it(
     assert report["components_kept"] == 1
     nearest = np.linalg.norm(body.volume.ijk_to_lps(vertices) - seed, axis=1).min()
     assert nearest < 5.0  # mm, a voxel or two: measured up to 2.3
-    assert share_near(body, vertices, "bone", "metal", "table") > 0.98  # measured from 0.994 on
+    # A prosthesis is in one piece with the pelvis: measured from 0.988 on; what lies by the table alone is none of it.
+    assert share_near(body, vertices, "bone", "metal") > 0.98
 
 
 @pytest.mark.parametrize("name", daily(4, SPINELESS))

@@ -289,7 +289,7 @@ def test_surface_below_a_level_is_closed_at_its_region_by_a_value_above(mesh_wit
         (["--region", "box:900,910,900,910,900,910"], 3, "no voxel lies in the box"),
         (["--region", "hu:100,300", "--region", "box:,,,,138.5,"], 3, "region is empty"),
         (["--region", "hu:5000,"], 3, "holds no voxel"),
-        (["--region", "hu:200,", "--region", "seed:900,0,0"], 3, "900"),
+        (["--region", "hu:200,", "--region", "seed:900,0,0"], 3, "lies outside of the volume"),
         (["--region", "mask:missing.nrrd"], 3, "no label map"),
         (["--region", "tube:30"], 4, "spinal canal"),
         (["--region", "tube:30:missing.csv"], 3, "missing.csv"),

@@ -123,6 +123,7 @@ def warn_of_auto_level(slice_spacing_mm: float) -> list[str]:
 
 
 def test_auto_in_slices_3_mm_apart_is_warned_of_with_its_iso_value() -> None:
+    # Beyond 2.5 mm; the next test has less.
     (warning,) = warn_of_auto_level(slice_spacing_mm=3.0)
     assert "slices are 3 mm apart" in warning
     assert f"{(BONE_HU + TISSUE_HU) / 2:g} HU" in warning

@@ -48,7 +48,7 @@ def make_noise(dtype: Any = np.int16, **place: Any) -> Volume:
 
 
 SPANS = 5
-"""Of the 40 slices: 8 each, as few as a span gets."""
+"""Of the 40 slices: 8 each, the fewest that a span gets."""
 
 
 def uneven_places() -> dict[str, Any]:
