@@ -42,6 +42,9 @@ def test_the_share_of_a_slice_within_a_neighbour_counts_beyond_chance(five_slice
 
 def test_a_slice_less_like_its_neighbours_than_these_are_like_each_other_is_a_ghost(five_slices: GhostSlices) -> None:
     assert (five_slices.slices, five_slices.tested) == ((2,), 3)
+
+
+def test_warnings_of_the_counts_are_those_of_the_judged_slices(five_slices: GhostSlices) -> None:
     assert five_slices.warnings == ("a word",)
 
 

@@ -152,7 +152,8 @@ def test_gif_repeats_and_takes_the_time_of_its_frames_in_hundredths_of_a_second(
 
 
 def test_large_frame_of_a_gif_is_as_near_as_one_whose_colours_all_pixels_chose(tmp_path):
-    j, i = np.indices((520, 600)) / 600.0
+    large = (520, 600)  # 2 x 256 and more along the shorter side: one of two pixels chooses colours
+    j, i = np.indices(large) / 600.0
     frame = np.stack([255 * i, 200 * j, 128 + 127 * np.sin(9 * i * j)], axis=-1).astype(np.uint8)
     write_animation(iter([frame, frame]), tmp_path / "a.gif")
     with Image.open(tmp_path / "a.gif") as read:

@@ -197,7 +197,7 @@ SMOOTHED_VOLUME = 2e-3  # the gate is 5e-3
 DECIMATED_VOLUME = 2e-3  # triangles of 3 mm on a sphere of 20 mm lie on both sides of it
 SAMPLED_PLANE_MM = 0.01  # quantiles and means of 20,000 even samples of 30 mm
 SAMPLED_CENTRE_MM = 0.02  # mean of 3000 even samples of a triangle of 9 mm
-TWO_BALLS_MM = 0.003  # triangles of balls of 60 rings lie up to 0.004 mm below their vertices; measured 0.0014
+TWO_BALLS_MM = 0.003  # gap of balls of the same 60 rings, whose triangles sag alike (0.008 mm); measured 0.0014
 SHELL_WALL_MM = 0.005  # two spheres, each with triangles of some 0.6 mm that sag 0.003 mm; measured 0.0012
 DIFFERENCE_HU = 1e-7  # rounding of values up to 1000 HU, 1e-13, over a step of 2e-4; measured 4e-9
 FLOAT32_PLANE_MM = 1e-4  # voxels of float32 up to 500 HU, 40 HU a mm
@@ -298,7 +298,7 @@ WINDOW_SHARE = 0.51 / 16384  # weights of 14 bits, rounded
 # --- points ---
 SPLAT_DEPTH_MM = 1e-4  # float32 sums of 60 mm, and their products with a slanted ray: measured 8e-6
 SPLAT_COLOR_LEVELS = 1.01  # of 255: the table of highlights and the last rounding
-FAR_SPLAT_SHARE = 0.01  # pixels at rims of discs, whose points moved by a step of float32
+FAR_SPLAT_SHARE = 0.01  # pixels at rims of discs or triangles, moved by a step of float32
 LAYER_LEVELS = 2.6  # of 255: rounding of colour and opacity, and the hundredth behind what is nearly opaque
 RAY_LENGTH_SHARE = 1e-6  # the length of a slanted ray in float32, and the product with it
 BALL_MESH_DEPTH_MM = 0.02  # a ball of 8 mm of 90 rings lies 0.005 mm below its sphere, and its depth at a slope of 4

@@ -15,6 +15,7 @@ from ct_files import find_words, write_series
 from label_files import write_nifti
 
 from clrecon.cli.main import main
+from clrecon.errors import PARTLY_DONE
 from clrecon.proof.phantom import PhantomSettings, write_phantom
 
 
@@ -42,7 +43,7 @@ def write_cohort(folder: Path) -> Path:
 def cohort(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the manifest m.csv, and out/ with three balls, A, B and C, and the case "gone" without a scan."""
     folder = write_cohort(tmp_path_factory.mktemp("cohort"))
-    assert main(["batch", str(folder / "m.csv"), "-o", str(folder / "out"), "--hu", "0", "-q"]) == 8
+    assert main(["batch", str(folder / "m.csv"), "-o", str(folder / "out"), "--hu", "0", "-q"]) == PARTLY_DONE
     return folder
 
 
@@ -56,7 +57,7 @@ def test_case_without_a_scan_is_refused_and_the_others_are_done(cohort: Path) ->
 
 def test_case_without_a_scan_is_named_with_its_input(tmp_path: Path, printed: Any) -> None:
     (tmp_path / "m.csv").write_text("case,input\ngone,nowhere-4711\n")
-    assert main(["batch", str(tmp_path / "m.csv"), "-o", str(tmp_path / "out")]) == 8
+    assert main(["batch", str(tmp_path / "m.csv"), "-o", str(tmp_path / "out")]) == PARTLY_DONE
     printed().assert_error("gone", "nowhere-4711")
 
 
@@ -144,7 +145,7 @@ def whole_batch(cohort: Path, tmp_path: Path) -> Batch:
 def test_part_of_a_batch_writes_its_cases_and_no_table(tmp_path: Path) -> None:
     batch = Batch(write_cohort(tmp_path))
 
-    assert batch.run("--part", "1/2", "--no-picture", "-q") == 8
+    assert batch.run("--part", "1/2", "--no-picture", "-q") == PARTLY_DONE
 
     # Of A, B, gone and C the first and the third.
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["A", "gone"]
@@ -161,7 +162,7 @@ def test_resume_makes_missing_and_changed_cases_and_ends_with_the_files_of_a_who
     (output / "A" / "mesh.stl").write_bytes(b"cut")
     printed()
 
-    assert whole_batch.run("--resume", "--json") == 8
+    assert whole_batch.run("--resume", "--json") == PARTLY_DONE
 
     report = printed().report()
     assert (report["cases"], report["made"], report["kept"]) == (4, 3, 1)  # the case that is gone is tried again
@@ -173,7 +174,7 @@ def test_resume_makes_missing_and_changed_cases_and_ends_with_the_files_of_a_who
 def test_resume_of_a_whole_batch_keeps_its_cases_and_tries_refused_ones_again(whole_batch: Batch, printed: Any) -> None:
     printed()
 
-    assert whole_batch.run("--resume", "--json") == 8
+    assert whole_batch.run("--resume", "--json") == PARTLY_DONE
 
     report = printed().report()
     assert (report["made"], report["kept"], report["statuses"]) == (1, 3, {"done": 3, "refused": 1})
@@ -183,7 +184,7 @@ def test_resume_of_a_whole_batch_keeps_its_cases_and_tries_refused_ones_again(wh
 def test_resume_with_another_setting_makes_all_cases(whole_batch: Batch, printed: Any) -> None:
     printed()
 
-    assert whole_batch.run("--resume", "--json", hu="250") == 8
+    assert whole_batch.run("--resume", "--json", hu="250") == PARTLY_DONE
 
     report = printed().report()
     assert (report["made"], report["kept"]) == (4, 0)
@@ -209,7 +210,7 @@ def test_collect_lists_a_case_that_was_not_made_as_missing_and_makes_none(whole_
     before = files_of(output / "A")
     printed()
 
-    assert whole_batch.run("--collect", "--json") == 8
+    assert whole_batch.run("--collect", "--json") == PARTLY_DONE
 
     assert printed().report()["statuses"] == {"done": 1, "missing": 1}
     assert read_rows(output)["later"]["status"] == "missing"
@@ -267,7 +268,7 @@ def test_case_that_fails_a_strict_gate_has_status_gate_and_keeps_its_mesh(tmp_pa
     write_phantom(tmp_path / "ct", PhantomSettings(kind="sphere", size=(24, 24), slices=16, noise=0.0, missing=(7,)))
     (tmp_path / "m.csv").write_text("case,input\na,ct\n")
     command = ["batch", str(tmp_path / "m.csv"), "-o", str(tmp_path / "out"), "--hu", "300", "--allow-gaps", "-q"]
-    assert main([*command, "--strict"]) == 8
+    assert main([*command, "--strict"]) == PARTLY_DONE
     assert read_rows(tmp_path / "out")["a"]["status"] == "gate"
     assert (tmp_path / "out" / "a" / "mesh.stl").exists()
 

@@ -89,7 +89,7 @@ def test_signed_distance_on_a_face_and_at_a_corner_is_zero_and_not_negative_zero
 
 @pytest.fixture(scope="module")
 def small_and_large_ball() -> tuple[Mesh, Mesh]:
-    """Balls of 10 and 12 mm about one centre: vertices lie on the spheres, the triangles up to 0.02 mm within."""
+    """Balls of 10 and 12 mm about one centre, of the same rings: their triangles lie within the spheres alike."""
     return Mesh(*ball(10.0, rings=60)), Mesh(*ball(12.0, rings=60))
 
 

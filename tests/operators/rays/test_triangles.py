@@ -373,7 +373,8 @@ def test_a_mesh_far_from_the_origin_looks_as_the_same_mesh_near_it(device: Any) 
     away = Mesh(mesh.vertices.astype(np.float64) + 1e5, mesh.triangles)
     assert away.vertices.dtype == np.float64
     far = clrecon.render(away, size=SIZE, view=(20, 30), device=device)
-    assert (np.abs(far.image.astype(int) - near.image).max(axis=-1) > 2).mean() < tolerances.FAR_SPLAT_SHARE
+    is_other = np.abs(far.image.astype(int) - near.image).max(axis=-1) > 2  # of 255: more than a step of float32 does
+    assert is_other.mean() < tolerances.FAR_SPLAT_SHARE  # pixels at the rim and along edges of triangles
 
 
 def test_layers_beyond_the_most_are_left_out_and_the_report_warns_of_their_pixels(device: Any) -> None:

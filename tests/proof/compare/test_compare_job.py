@@ -35,6 +35,7 @@ pytestmark = pytest.mark.first_device
 
 MOST_BYTES = 2_000_000
 OF_TIME = re.compile(r"_s$|_ms$|seconds|_bytes$|^date$|free_cores|findings|warnings")
+"""Entries of times, memory and the machine's load; findings and warnings tell of these too."""
 NOBODY_TELLS = "import os; os.abort()"
 ONE_CRASHES = """
 import io, json, os, sys
@@ -253,13 +254,13 @@ def without_time(value: Any) -> Any:
 
 @pytest.mark.release
 @pytest.mark.long
-def test_two_comparisons_differ_in_times_and_memory_alone(
-    device: Any, ball: Path, tmp_path: Path, request: pytest.FixtureRequest
+def test_comparison_in_one_process_has_the_figures_and_pictures_of_one_with_a_process_for_each_method(
+    device: Any, ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settings = CompareSettings(methods=("t-mc", "vtk-fe", "cloud"), repeat=1, device=str(device.index))
-    for name in ("one", "other"):
-        make_comparison(ball, tmp_path / name, settings)
-        request.getfixturevalue("in_this_process")
+    make_comparison(ball, tmp_path / "one", settings)
+    leave_processes_out(monkeypatch)
+    make_comparison(ball, tmp_path / "other", settings)
     one, other = (read_report(tmp_path / name) for name in ("one", "other"))
     assert without_time(one) == without_time(other)
     pictures = sorted(path.name for path in (tmp_path / "one").glob("*.png"))

@@ -274,7 +274,7 @@ def test_lights_of_the_same_parameters_have_one_hash() -> None:
 
 
 @pytest.mark.parametrize(
-    ("parameters", "message"),
+    ("parameters", "facts"),
     [
         ({"ambient": -0.1}, ("ambient", 0, 1, -0.1)),
         ({"diffuse": 1.1}, ("diffuse",)),
@@ -289,6 +289,6 @@ def test_lights_of_the_same_parameters_have_one_hash() -> None:
         ({"direction": "up"}, ("LPS",)),
     ],
 )
-def test_lighting_out_of_range_is_refused(parameters: dict, message: str) -> None:
-    with refused(UsageError, *message):
+def test_impossible_parameter_of_lighting_is_refused(parameters: dict, facts: tuple) -> None:
+    with refused(UsageError, *facts):
         Lighting(**parameters)
