@@ -38,7 +38,7 @@ from clrecon.jobs.view import ViewSettings
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.options import numbers_reader, option, options_of
 from clrecon.system.records import describe_volume
-from clrecon.system.text import count_of
+from clrecon.system.text import count_of, to_hexadecimal
 
 _LABELS_LISTED = 24
 _PARTS = ("read", "mask", "render", "turntable", "write")
@@ -372,7 +372,7 @@ def _describe_input(report: dict[str, Any]) -> str:
 
 
 def _describe_mesh(mesh: dict[str, Any]) -> str:
-    color = "#" + "".join(f"{round(255 * share):02x}" for share in mesh["color"])
+    color = to_hexadecimal(mesh["color"])
     return f"{count_of(mesh['triangles'], 'triangle')}, {color}, opacity {mesh['opacity']:g}, {mesh['file']['space']}"
 
 

@@ -36,6 +36,7 @@ from clrecon.system.color_scale import ColorScale
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.packing import GZIP, find_deflate, start_packing
 from clrecon.system.pieces import find_bounds, side_by_side
+from clrecon.system.text import to_hexadecimal
 from clrecon.version import package_version
 
 STEPS = 65_535
@@ -278,7 +279,8 @@ def _code_values(meshes: Sequence[Content]) -> tuple[list[dict[str, Any]], NDArr
     Where none is known it is `STEPS`.
     """
     joined = join_numbers([(mesh.values, len(mesh.vertices)) for mesh in meshes])
-    columns, codes = list[dict[str, Any]](), [np.empty((sum(len(mesh.vertices) for mesh in meshes), 0), np.uint16)]
+    columns: list[dict[str, Any]] = []
+    codes = [np.empty((sum(len(mesh.vertices) for mesh in meshes), 0), np.uint16)]
     for name, values in joined.items():
         scale = ColorScale.spanning(values) if name.endswith("_mm") else None
         if scale is None:
@@ -288,7 +290,7 @@ def _code_values(meshes: Sequence[Content]) -> tuple[list[dict[str, Any]], NDArr
         step = (high - low) / (STEPS - 1) or 1.0
         places = np.rint((np.where(known, values, low).astype(np.float64) - low) / step)
         codes.append(np.where(known, places, STEPS).astype(np.uint16)[:, None])
-        colors = [_hexadecimal(color / 255.0) for color in scale.table]
+        colors = [to_hexadecimal(color / 255.0) for color in scale.table]
         columns.append({"name": name, "low": low, "step": step, "ticks": scale.ticks, "colors": colors})
     return columns, np.concatenate(codes, axis=1)
 
@@ -311,7 +313,7 @@ def _join_parts(meshes: Sequence[Content], numbers: NDArray[np.uint16]) -> tuple
         for name, count, ml in _pieces(mesh):
             called = mesh.title or mesh.name or (f"surface {number}" if len(meshes) > 1 else "")
             named = " ".join(filter(None, (called, name)))
-            color = _hexadecimal(BONE_COLOR if mesh.color is None else mesh.color)
+            color = to_hexadecimal(BONE_COLOR if mesh.color is None else mesh.color)
             parts.append({"name": named or "surface", "color": color, "ml": ml, "first": first, "count": count})
             first += count
     coded = encode_surface(np.concatenate(vertices), np.concatenate(normals), np.concatenate(triangles), numbers)
@@ -351,10 +353,6 @@ def _inside(mesh: Content) -> str | None:
     if mesh.inside is not None:
         return mesh.inside
     return None if mesh.iso_value_hu is None else f"iso value {mesh.iso_value_hu:g} HU"
-
-
-def _hexadecimal(color: Sequence[float]) -> str:
-    return "#" + "".join(f"{round(255 * min(max(value, 0.0), 1.0)):02x}" for value in color)
 
 
 def _script(slices: PackedSlices | None) -> str:

@@ -29,7 +29,7 @@ from clrecon.exchange.raw_content import MOST_LEVELS, Part, PlacedShapes, RawMes
 from clrecon.system.light_dataclass import dataclass, field
 from clrecon.system.packing import RAW, find_deflate, start_packing
 from clrecon.system.paths import open_regular
-from clrecon.system.text import escape_text
+from clrecon.system.text import escape_text, to_hexadecimal
 
 _PIECE_OUT = 1 << 22
 _MODEL = "3D/3dmodel.model"
@@ -113,9 +113,8 @@ def _attribute(text: str) -> str:
 def _opening(parts: Sequence[Content]) -> str:
     colors = ""
     if _has_colors(parts):
-        bases = "".join(
-            f'<base name="{_attribute(part.name or "bone")}" displaycolor="{_hexadecimal(part)}"/>\n' for part in parts
-        )
+        shown = [(_attribute(part.name or "bone"), to_hexadecimal(part.color or BONE_COLOR).upper()) for part in parts]
+        bases = "".join(f'<base name="{name}" displaycolor="{color}"/>\n' for name, color in shown)
         colors = f'<basematerials id="1">\n{bases}</basematerials>\n'
     return (
         f'{_DECLARATION}<model unit="millimeter" xml:lang="en-US" '
@@ -124,11 +123,6 @@ def _opening(parts: Sequence[Content]) -> str:
         f'<metadata name="Description">{_description(parts[0])}</metadata>\n'
         f"<resources>\n{colors}"
     )
-
-
-def _hexadecimal(part: Content) -> str:
-    red, green, blue = (round(255 * value) for value in part.color or BONE_COLOR)
-    return f"#{red:02X}{green:02X}{blue:02X}"
 
 
 def _description(content: Content) -> str:

@@ -114,3 +114,8 @@ def join_names(names: Iterable[object]) -> str:
     names = list(names)
     shown = ", ".join(map(str, names[:NAMES_SHOWN]))
     return shown if len(names) <= NAMES_SHOWN else f"{shown} and {len(names) - NAMES_SHOWN} more"
+
+
+def to_hexadecimal(rgb: Iterable[float]) -> str:
+    """Return a colour of red, green and blue, 0 to 1, as ``#rrggbb``."""
+    return "#" + "".join(f"{round(255 * min(max(float(share), 0.0), 1.0)):02x}" for share in rgb)

@@ -6,6 +6,7 @@ import base64
 import threading
 import weakref
 from collections.abc import Iterable, Sequence
+from contextlib import ExitStack
 from functools import partial
 from html import escape
 from pathlib import Path
@@ -33,8 +34,6 @@ if TYPE_CHECKING:
     from clrecon.reading.common.source_facts import SeriesListing
     from clrecon.rendering import Rendering
     from clrecon.viewer.model.objects import ShownObject
-    from clrecon.viewer.session.opening import OpenedView
-    from clrecon.viewer.web.server import WebServer
 
 log = get_logger(__name__)
 
@@ -185,20 +184,19 @@ class LivePage(Closing):
         from clrecon.viewer.session.opening import OpenedView
         from clrecon.viewer.web.server import WebServer
 
-        self._view = OpenedView(objects, settings)
-        try:
-            self._server = WebServer(is_framed=True)
-            self.address, self.port = self._server.address, self._server.port
+        with ExitStack() as opened:
+            self._view = opened.enter_context(OpenedView(objects, settings))
             self._picture = self._draw()
+            server = opened.enter_context(WebServer(is_framed=True))
+            self.address, self.port = server.address, server.port
             folders: SimpleQueue[Path] = SimpleQueue()
-            serve = partial(self._server.serve, self._view.session, folders.put)
+            serve = partial(server.serve, self._view.session, folders.put)
             self._thread = threading.Thread(target=serve, name="clrecon-live-page", daemon=True)
             self._thread.start()
+            opened.callback(self._thread.join, _PATIENCE_S)
+            opened.callback(server.stop)
             self._folder = folders.get(timeout=_PATIENCE_S)
-        except BaseException:
-            self._view.close()
-            raise
-        self._end = weakref.finalize(self, _end_page, self._server, self._thread, self._view)
+            self._end = weakref.finalize(self, opened.pop_all().close)
 
     def close(self) -> None:
         self._end()
@@ -210,13 +208,13 @@ class LivePage(Closing):
         open_browser(self.address, self._folder)
 
     def __repr__(self) -> str:
-        if not self._end.alive:
+        if not self._thread.is_alive():
             return "LivePage(closed)"
         return f"LivePage(port {self.port} of this machine: open() shows it in the browser)"
 
     def _repr_html_(self) -> str:
         frame = ""
-        if self._end.alive:
+        if self._thread.is_alive():
             frame = (
                 f'<iframe src="{escape(self.address)}" title="{escape(repr(self))}" width="100%"'
                 f' height="{_LIVE_HEIGHT}" style="border: 0"></iframe>'
@@ -229,10 +227,3 @@ class LivePage(Closing):
     def _draw(self) -> str:
         model = self._view.model(_PICTURE_SIZE[0] / _PICTURE_SIZE[1])
         return _image(self._view.painter.picture(model.state, _PICTURE_SIZE))
-
-
-def _end_page(server: WebServer, thread: threading.Thread, view: OpenedView) -> None:
-    server.stop()
-    thread.join(_PATIENCE_S)
-    with server:  # its port is free again
-        view.close()

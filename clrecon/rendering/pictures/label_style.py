@@ -15,6 +15,7 @@ from clrecon.rendering.looks.colors import find_color
 from clrecon.rendering.views.reformation import Sheet
 from clrecon.system.base_classes import Message
 from clrecon.system.light_dataclass import dataclass
+from clrecon.system.text import to_hexadecimal
 
 NO_COLOR = (-1.0, -1.0, -1.0)
 """Colour in the table that means: keep the colour of the picture without labels."""
@@ -182,11 +183,7 @@ def list_legend(look: LabelStyle) -> list[tuple[str, str]]:
     """Return the colour (#rrggbb) and name, as files can have it, of each label that is coloured and not hidden."""
     numbers = [n for n in look.labels.numbers if look.table[n, 0] >= 0.0 and look.table[n, 3] > 0.0]
     names = file_suffixes({n: look.labels.name(n) for n in numbers})
-    return [(_to_hexadecimal(look.table[n, :3]), names[n]) for n in numbers]
-
-
-def _to_hexadecimal(rgb: NDArray[np.float32]) -> str:
-    return "#" + "".join(f"{round(255 * float(share)):02x}" for share in rgb)
+    return [(to_hexadecimal(look.table[n, :3]), names[n]) for n in numbers]
 
 
 def facts_of_overlay(numbers: NDArray[Any], look: LabelStyle) -> list[dict[str, Any]]:
@@ -198,7 +195,7 @@ def facts_of_overlay(numbers: NDArray[Any], look: LabelStyle) -> list[dict[str, 
         {
             "label_number": int(n),
             "label": names[int(n)],
-            "color": _to_hexadecimal(look.table[n, :3]),
+            "color": to_hexadecimal(look.table[n, :3]),
             "pixels": int(counts[n]),
         }
         for n in shown
