@@ -9,7 +9,8 @@ from typing import Any
 from clrecon.cli import common
 from clrecon.cli.console import Console, printable
 from clrecon.jobs.mesh.purposes import settings_for
-from clrecon.jobs.mesh.settings import GATE_FAILED, SCAN_GATE_FAILED, LabelChoice, MeshSettings, is_label_seed
+from clrecon.jobs.mesh.seeds import is_label_seed
+from clrecon.jobs.mesh.settings import GATE_FAILED, SCAN_GATE_FAILED, LabelChoice, MeshSettings
 from clrecon.jobs.mesh.surfaces import VALUE_GATES, names_level
 from clrecon.jobs.outputs import MESH_FILES, name_outputs
 from clrecon.jobs.presets import PRESETS

@@ -12,8 +12,8 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 99_224,
-    "modules": 433,
+    "lines": 99_276,
+    "modules": 436,
     "small_modules_with_one_reader": 8,
     "docstrings_with_raises": 137,
     "options_in_several_files": 8,

@@ -15,7 +15,8 @@ from clrecon.errors import RefusedInputError, UsageError
 from clrecon.jobs import corridor_results
 from clrecon.jobs.mesh import bone, make, purposes
 from clrecon.jobs.mesh.purposes import settings_for
-from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings, check_growing
+from clrecon.jobs.mesh.seeds import check_growing
+from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.jobs.mesh.surfaces import Surface, check_known_values, choose_level, plan_surfaces
 from clrecon.jobs.options import parse_bytes, parse_hu, parse_preprocess
 from clrecon.jobs.render.job import PictureFiles, check_pictures, find_emptiness, make_pictures

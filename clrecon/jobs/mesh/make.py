@@ -20,7 +20,8 @@ from clrecon.jobs.inputs import read_with_labels
 from clrecon.jobs.mesh.bone import find_bone
 from clrecon.jobs.mesh.labels import extract_label_surfaces, open_labels
 from clrecon.jobs.mesh.purposes import measure_pieces
-from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings, find_seeds
+from clrecon.jobs.mesh.seeds import find_seeds
+from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.jobs.mesh.surfaces import Part, Surface, check_known_values, choose_level, plan_surfaces
 from clrecon.jobs.outputs import MOST_FILES
 from clrecon.jobs.preprocess import Band, mask_volume, preprocess_volume, restrict_volume

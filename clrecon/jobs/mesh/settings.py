@@ -1,6 +1,4 @@
-"""Settings of the mesh job, validated on construction: labels that become meshes, points and labels that surfaces grow
-from, and the rest.
-"""
+"""Settings of the mesh job, validated on construction, and those of labels that become meshes."""
 
 from __future__ import annotations
 
@@ -8,11 +6,12 @@ import math
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from clrecon.errors import UsageError
 from clrecon.jobs import options
 from clrecon.jobs.cluster import LOCAL
+from clrecon.jobs.mesh.seeds import LABEL_SEED, check_growing, check_point, is_label_seed, parse_seed
 from clrecon.jobs.outputs import OBJECT_FILES
 from clrecon.jobs.presets import DEFAULT_PRESET, PURPOSES, Purpose, find_iso_preset, find_purpose
 from clrecon.system.arguments import MethodName, Space, Topology, VertexRule, name_parameter
@@ -80,70 +79,6 @@ class LabelChoice:
         return {number: as_point(color) for number, color in zip(numbers, palette, strict=True)} | given
 
 
-_LABEL_SEED = "label:"
-"""What a seed that is a label begins with."""
-
-
-def is_label_seed(seed: object) -> bool:
-    return isinstance(seed, str) and seed.startswith(_LABEL_SEED)
-
-
-def check_point(seed: Sequence[float]) -> None:
-    if len(seed) != 3 or not all(map(math.isfinite, seed)):
-        raise UsageError(f"a seed is a point of three numbers in mm, not {tuple(seed)}")
-
-
-def check_growing(
-    method: str,
-    grow_from: Sequence[str | Sequence[float]],
-    vertex_rule: str,
-    *,
-    topology: str,
-    inside: str,
-    has_labels: bool,
-    makes_labels: bool,
-) -> None:
-    """Check the seeds, the method and the vertex rule of a mesh job, each and with its other settings."""
-    for seed in grow_from:
-        if not isinstance(seed, str):
-            check_point(seed)
-        elif seed != "auto" and not (is_label_seed(seed) and seed[len(_LABEL_SEED) :].strip()):
-            raise UsageError(f"{name_parameter('grow_from')} is auto, X,Y,Z in mm or label:NAME, not {seed!r}")
-    from clrecon.geometry.vertices import check_vertex_rule
-    from clrecon.operators.surface.methods import check_method
-
-    chosen = check_method(
-        method, grows=bool(grow_from), vertex_rule=vertex_rule, topology=topology, plain=inside == "above"
-    )
-    check_vertex_rule(vertex_rule, topology)
-    from_labels = any(map(is_label_seed, grow_from))
-    if from_labels and not has_labels:
-        raise UsageError(f"a label to grow from needs its label map: give its file with {name_parameter('labels')}")
-    if from_labels and makes_labels:
-        raise UsageError("a label map to grow from makes no meshes of its own: leave the labels for meshes out")
-    if has_labels and not from_labels and (chosen.grows or not chosen.on_device or vertex_rule != "linear"):
-        raise UsageError(
-            f"labels pick the cells of their surfaces: leave {name_parameter('method')},"
-            f" {name_parameter('grow_from')} and {name_parameter('vertex_rule')} out, or grow from label:NAME"
-        )
-
-
-def find_seeds(grow_from: Sequence[str | Sequence[float]], space: str, labels: LabelMap | None) -> list[Any]:
-    """Return seeds in mm of the frame `space` as `extract_isosurface` takes them; none are "auto"."""
-    from clrecon.geometry import frame_from_lps
-
-    seeds: list[Any] = []
-    for seed in grow_from or ("auto",):
-        if not isinstance(seed, str):
-            seeds.append((frame_from_lps(space).T @ seed).tolist())
-        elif is_label_seed(seed):
-            name = seed[len(_LABEL_SEED) :].strip()
-            seeds.append((labels, int(name) if name.isascii() and name.isdigit() else name))
-        else:
-            seeds.append(seed)
-    return seeds
-
-
 _ITERATIONS = 20
 
 METHOD_NAMES = ("t-mc", "i-mc", "g-mc", "s-mc", "t-mc-soup", "skimage")
@@ -160,18 +95,6 @@ def _describe_purpose(purpose: Purpose) -> str:
         if value is not True:
             words += value if isinstance(value, tuple) else [f"{value}"]
     return f"{purpose.name}: {' '.join(words)}: {purpose.description}".replace("%", "%%")
-
-
-def _parse_seed(text: str) -> str | tuple[float, ...]:
-    """Read ``auto``, ``label:NAME`` or ``X,Y,Z``."""
-    if text.lower() == "auto":
-        return "auto"
-    if text.lower().startswith(_LABEL_SEED):
-        return f"{_LABEL_SEED}{text[len(_LABEL_SEED) :]}"
-    try:
-        return options.parse_point(text)
-    except ValueError:
-        raise ValueError(f"{text!r} is neither auto nor X,Y,Z in mm nor label:NAME") from None
 
 
 def name_level(level: float | Sequence[float]) -> str:
@@ -260,7 +183,7 @@ class MeshSettings(options.InputSettings):
         "seeds of i-mc: auto, all parts with at least 1/20 of the cells of the largest; a point in mm of the frame of"
         " --space, at most 10 mm from the surface; or a label of --labels; may be given again",
         default=(),
-        parse=_parse_seed,
+        parse=parse_seed,
         action="append",
     )
     vertex_rule: VertexRule = _method_option(
@@ -552,7 +475,7 @@ class MeshSettings(options.InputSettings):
 
     @property
     def seed_labels(self) -> tuple[str, ...]:
-        return tuple(str(seed)[len(_LABEL_SEED) :] for seed in self.grow_from if is_label_seed(seed))
+        return tuple(str(seed)[len(LABEL_SEED) :] for seed in self.grow_from if is_label_seed(seed))
 
     @property
     def method_used(self) -> MethodName:

@@ -10,7 +10,7 @@ from enhanced_series import write_enhanced
 from variants import daily
 
 from clrecon.reading import list_series, read_volume
-from clrecon.reading.dicom.series.series import CLOSEST, LOCALIZERS, WIDER
+from clrecon.reading.dicom.series.census import CLOSEST, LOCALIZERS, WIDER
 
 SLICES = 24
 STATED = set_values(ImagesInAcquisition=SLICES, NumberOfSeriesRelatedInstances=str(SLICES))

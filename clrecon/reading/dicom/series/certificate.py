@@ -25,9 +25,10 @@ from clrecon.reading.common.likeness import Likeness
 from clrecon.reading.common.source_facts import PixelFacts
 from clrecon.reading.dicom.headers.slice_header import SliceHeader
 from clrecon.reading.dicom.parse.transfer_syntaxes import SYNTAX_NAMES
+from clrecon.reading.dicom.series.census import facts_of_numbers, judge_numbers
 from clrecon.reading.dicom.series.phases import choose_phase, describe_spacing
 from clrecon.reading.dicom.series.scan import Scan
-from clrecon.reading.dicom.series.series import Series, facts_of_numbers, judge_numbers
+from clrecon.reading.dicom.series.series import Series
 from clrecon.reading.dicom.stack import fit
 from clrecon.reading.dicom.stack.mixtures import describe_differences
 from clrecon.system.arguments import name_parameter
