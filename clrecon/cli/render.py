@@ -229,7 +229,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     others = f"a cloud of points ({', '.join(CLOUD_INPUTS)}); or a mesh ({', '.join(MESH_INPUTS)}; of .ply and .vtp say"
     text = f"{common.SCAN_FOLDER}; {common.GRID_FILE}; {others} --mode mesh); may be left out with --mesh"
     common.add_input(parser, text, nargs="?")
-    common.add_output(parser, "picture: .png, .jpg or .tif; may be left out with --turntable", required=False)
+    common.add_output(
+        parser, "picture: .png, .jpg, .tif, .svg (letters as text); may be left out with --turntable", required=False
+    )
     shown = parser.add_argument_group("what is shown")
     common.add_fields(shown, Looks)
     common.add_fields(shown, ViewSettings, "state")

@@ -400,6 +400,16 @@ def test_annotation_is_drawn_beside_the_middle_of_the_picture(option: list[str],
     assert not is_lit(drawn)[60:68, 60:68].any()
 
 
+def test_figure_of_a_resolution_is_an_svg_of_its_size_in_mm_with_letters_as_text(render: Renders) -> None:
+    report = render.report("-o", render.folder / "a.svg", "--letters", "--dpi", 254, "--size", "200x100")
+
+    figure = (render.folder / "a.svg").read_text()
+    assert 'width="20mm" height="10mm"' in figure
+    assert [f">{letter}</text>" in figure for letter in "RLSI"] == [True] * 4
+    assert report["dpi"] == 254.0
+    assert report["pictures"][0]["output"] == {"format": "svg", "bytes": len(figure)}
+
+
 def test_turntable_into_a_gif_has_its_frames_and_bytes_in_the_report(render: Renders) -> None:
     report = render.report("--turntable", render.folder / "a.gif", "--frames", "3", "--fps", "10")
 
@@ -513,6 +523,7 @@ WRONG = {
     "no spine": (["--curve", "auto"], 4, "no spine was found that one could be sure of"),
     "curve file": (["--curve", "nowhere.csv"], 3, "there is no file"),
     "small letters": (["--letters", "--size", "20"], 3, "at least 64"),
+    "coarse print": (["--dpi", "10"], 3, "36 to 4,800 pixels per inch"),
     "function file": (["--transfer-function", "nowhere.json"], 3, "nowhere.json"),
     "long name of a function": (["--transfer-function", "a" * 300 + ":b"], 4, "File name too long"),
     "long name of labels": (["--labels", "a" * 300], 4, "File name too long"),

@@ -139,6 +139,7 @@ class PictureReport(RunReport):
     shadows: bool
     jitter: bool
     background: Any
+    dpi: float | None
     clip_planes_lps_mm: list[list[float]]
     thickness_mm: float | None
     combine: str | None
@@ -186,6 +187,7 @@ def report_of(
         shadows=getattr(style, "shadows", False),
         jitter=getattr(style, "jitter", False),
         background=settings.background,
+        dpi=settings.dpi,
         clip_planes_lps_mm=[] if clip is None else clip.planes.tolist(),
         thickness_mm=style.thickness if isinstance(style, PlaneCut | CurveCut) else None,
         combine=style.combine if isinstance(style, PlaneCut | CurveCut) and style.thickness else None,
@@ -480,7 +482,10 @@ def check_pictures(files: PictureFiles, settings: RenderSettings) -> list[tuple[
     owned: list[tuple[str, str | Path]] = [] if files.report is None else [("the report", files.report)]
     for role, path in of_views.items():
         if path is not None:
-            (check_image_path if role == "the picture" else check_float_path)(path)
+            if role == "the picture":
+                check_image_path(path, has_vectors=True)
+            else:
+                check_float_path(path)
             names = [name_view(view, settings.views_used) for view in settings.views_used]
             owned += [(f"{role} {name}".rstrip(), path_of(path, name)) for name in names]
     moving = [] if files.turntable is None else [("the turntable", files.turntable)]

@@ -151,7 +151,9 @@ class PictureTaker(Closing):
         else:
             picture = self._open_volume().render(self.style, background=settings.background, **view)
         letters = settings.letters and not self.style.is_sheet  # each slice of a sheet has its own
-        picture = picture.annotated(letters=letters, scale_bar=settings.scale_bar, caption=settings.caption)
+        picture = picture.annotated(
+            letters=letters, scale_bar=settings.scale_bar, caption=settings.caption, dpi=settings.dpi
+        )
         look = getattr(self.style, "label_style", None)
         if settings.legend and look is not None:
             picture = add_legend(picture, list_legend(look))

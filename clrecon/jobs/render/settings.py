@@ -38,6 +38,7 @@ from clrecon.rendering.pictures.modes import MODES, check_known, choose_mode, ke
 from clrecon.rendering.pictures.object_looks import MESH_COLORS as MESH_COLORS
 from clrecon.rendering.pictures.object_looks import POINT_COLORS as POINT_COLORS
 from clrecon.rendering.pictures.object_looks import MeshLook, PointLook
+from clrecon.rendering.pictures.picture import checked_dpi
 from clrecon.rendering.pictures.sheets import SHEET_SIZE
 from clrecon.rendering.pictures.style_checks import SHEET_SLICES as SHEET_SLICES
 from clrecon.rendering.pictures.styles import CURVED_KINDS as CURVED_KINDS
@@ -216,6 +217,11 @@ class RenderSettings(InputSettings):
     scale_bar: bool = _camera_option("--scale-bar", "draw a bar of a round length in mm")
     legend: bool = _camera_option("--legend", "draw the colours and names of the labels beside the picture")
     caption: str | None = _camera_option("--caption TEXT", "draw a line of text at the top left")
+    dpi: float | None = _camera_option(
+        "--dpi N",
+        "pixels per inch of the printed figure: text of 8 points, and the resolution in the file (default: text of a"
+        " share of the picture, and the size of a pixel in the patient)",
+    )
     turntable: Turntable | None = None
 
     @classmethod
@@ -265,6 +271,8 @@ class RenderSettings(InputSettings):
             find_color(self.background)
         if self.light is not None:
             _turn_light(self.light, Lighting())
+        if self.dpi is not None:
+            object.__setattr__(self, "dpi", checked_dpi(self.dpi))
         if self.mesh_space is not None:
             frame_from_lps(self.mesh_space)
             if not self.meshes and self.mode != "mesh":

@@ -20,6 +20,43 @@ if TYPE_CHECKING:
     from PIL import Image
 
 
+class Text(NamedTuple):
+    """A line of text on a picture; x and the baseline y are pixels from the top left corner, `size` is its height.
+
+    align: {"l", "m", "r"}. Where x lies in the line: at its left end, in the middle, at its right end.
+    outline: Colour around the letters, of `stroke` pixels; None: no outline.
+    """
+
+    text: str
+    x: float
+    y: float
+    align: str
+    size: float
+    fill: str = "black"
+    outline: str | None = None
+    stroke: float = 0.0
+
+
+class Bar(NamedTuple):
+    """A scale bar on a picture: left, top, width and height in pixels, with an outline of `stroke` pixels."""
+
+    left: float
+    top: float
+    width: float
+    height: float
+    fill: str
+    outline: str
+    stroke: float
+
+
+@dataclass(frozen=True, eq=False)
+class Drawing:
+    """What vector files draw in place of pixels: the picture without text and bars, (h, w, 4) uint8, and these."""
+
+    ground: NDArray[np.uint8]
+    marks: tuple[Text | Bar, ...] = ()
+
+
 @dataclass
 class PictureData(Message):
     """Pixels, depths and camera of a picture; see `clrecon.rendering.Rendering` for each attribute."""
@@ -31,6 +68,7 @@ class PictureData(Message):
     values: NDArray[np.float32] | None = None
     mode: str = "dvr"
     report: dict[str, Any] = field(default_factory=dict)
+    drawing: Drawing | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -58,6 +96,9 @@ LEAST_SHARE = 0.05
 
 TEXT_SHARE, _SMALLEST_TEXT = 1 / 28, 9.0
 """Height of the text as a share of the shorter side, and the smallest height in pixels."""
+
+_PRINTED_TEXT = 8.0 / 72.0
+"""Height of the text in inches of the printed figure: 8 points, which journals ask for."""
 
 LONGEST_BAR_SHARE = 0.35
 """Longest scale bar as a share of the width.  After rounding down to 1, 2 or 5 x 10^n mm it is at least 14 %."""
@@ -109,26 +150,34 @@ def bar_length(width_mm: float) -> float:
 
 
 def annotate(
-    rendering: PictureData, *, letters: bool = False, scale_bar: bool = False, caption: str | None = None
-) -> NDArray[np.uint8]:
-    """Draw annotations into a copy of a picture, (h, w, 4); without any it is the image of the picture itself.
+    rendering: PictureData,
+    *,
+    letters: bool = False,
+    scale_bar: bool = False,
+    caption: str | None = None,
+    dpi: float | None = None,
+) -> tuple[NDArray[np.uint8], Drawing | None]:
+    """Draw annotations into a copy of a picture, (h, w, 4), and return the drawing of vector files with it.
+
+    Without any annotation these are the picture's own.
 
     letters: Mark each edge with the side of the patient in its direction, see `orientation_letters`; along a curve only
         those that are true for all of the picture, see `sheet_letters`.
     scale_bar: Draw a bar of a round length at the bottom left.  In a perspective picture the bar is valid in the focal
         plane only, and its text says so.
     caption: One line of text at the top left, cut at the edge of the picture.
+    dpi: Pixels per inch of the printed figure, for text of 8 points; None: text of a share of the picture.
     """
     check_caption(caption)
     if not (letters or scale_bar or caption):
-        return rendering.image
+        return rendering.image, rendering.drawing
     width, height = rendering.size
     if min(width, height) < SMALLEST_SIDE:
         raise UsageError(
             f"a picture of {width} x {height} pixels is too small for letters or a scale bar:"
             f" at least {SMALLEST_SIDE} x {SMALLEST_SIDE}"
         )
-    page = _Page(rendering)
+    page = _Page(rendering, dpi)
     if letters:
         edges = rendering.report.get("edges") if rendering.camera is None else edge_letters(rendering.camera)
         if edges is None:
@@ -152,6 +201,11 @@ def annotate(
     return page.finish()
 
 
+def text_pixels(share: float, side: int, dpi: float | None) -> float:
+    """Return the height of text: 8 points of a figure printed with `dpi`, else a share of a side of the picture."""
+    return max(_SMALLEST_TEXT, share * side if dpi is None else _PRINTED_TEXT * dpi)
+
+
 def check_caption(caption: str | None) -> None:
     """Refuse a caption with characters that the font lacks: they would be drawn as boxes."""
     if not caption:
@@ -168,7 +222,7 @@ def check_caption(caption: str | None) -> None:
 class _Page:
     """A page for annotations: two masks, one for the strokes and one for the outlines around them."""
 
-    def __init__(self, rendering: PictureData):
+    def __init__(self, rendering: PictureData, dpi: float | None):
         load_pillow()
         from PIL import Image, ImageDraw
 
@@ -177,8 +231,10 @@ class _Page:
         self._masks = [Image.new("L", self._size, 0) for _ in range(2)]
         self._pens = [ImageDraw.Draw(mask) for mask in self._masks]
         self._ink = _choose_ink(rendering)
+        self._drawing = rendering.drawing or Drawing(rendering.image)
+        self._marks: list[Text | Bar] = []
         shorter = min(self._size)
-        text = max(_SMALLEST_TEXT, TEXT_SHARE * shorter)
+        text = text_pixels(TEXT_SHARE, shorter, dpi)
         self._font = load_font(text)
         self._margin = max(2, round(0.02 * shorter))
         self._stroke = max(1, round(text / 14.0))
@@ -207,6 +263,7 @@ class _Page:
             bottom -= round(self._font.size) + self._stroke  # above the letters of the bottom edge
         for pen, border in zip(self._pens, (self._stroke, 0), strict=True):
             pen.rectangle((left - border, bottom - thickness - border, end - 1 + border, bottom - 1 + border), fill=255)
+        self._marks.append(Bar(left, bottom - thickness, pixels, thickness, *self._pen_style))
         self._write((left, bottom - over), text, "ls")
 
     def draw_caption(self, text: str) -> None:
@@ -221,7 +278,7 @@ class _Page:
             line += "..."
         self._write(corner, line, "lt")
 
-    def finish(self) -> np.ndarray:
+    def finish(self) -> tuple[NDArray[np.uint8], Drawing]:
         from PIL import Image
 
         picture = self._picture
@@ -229,7 +286,12 @@ class _Page:
             layer: Image.Image = Image.new("RGBA", self._size, (grey, grey, grey, 0))
             layer.putalpha(mask)
             picture = Image.alpha_composite(picture, layer)
-        return np.array(picture)
+        return np.array(picture), Drawing(self._drawing.ground, (*self._drawing.marks, *self._marks))
+
+    @property
+    def _pen_style(self) -> tuple[str, str, float]:
+        fill, outline = ("white", "black") if self._ink.fill else ("black", "white")
+        return fill, outline, self._stroke
 
     def _write(self, corner: tuple[float, float], text: str, anchor: str) -> None:
         box = self._box(corner, text, anchor)
@@ -240,6 +302,8 @@ class _Page:
                 f"a picture of {width} x {height} pixels has no room for {text!r}: make it larger, or draw less in it"
             )
         self._boxes.append(box)
+        baseline = corner[1] + top - self._box(corner, text, f"{anchor[0]}s")[1]
+        self._marks.append(Text(text, corner[0], baseline, anchor[0], self._font.size, *self._pen_style))
         for pen, stroke in zip(self._pens, (self._stroke, 0), strict=True):
             pen.text(corner, text, 255, self._font, anchor, stroke_width=stroke)
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import base64
 import os
 from collections.abc import Sequence
+from html import escape
 from io import BytesIO
 from typing import Any, Literal
 
@@ -11,7 +13,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from clrecon.errors import UsageError
-from clrecon.rendering.pictures.annotations import PictureData
+from clrecon.rendering.pictures.annotations import Bar, Drawing, PictureData, Text
 from clrecon.rendering.pictures.pillow import load_pillow
 from clrecon.system.arguments import explains_arguments, name_parameter
 from clrecon.system.files import replace_file
@@ -41,6 +43,8 @@ class Rendering(PictureData):
     mode : str
     report : dict
         How the picture was made, without patient data.  ``"pixel_mm"`` is the side of a pixel if there is no camera.
+    drawing : Drawing or None
+        What `annotated` wrote on the picture, which SVG files have as text and bars.
     """
 
     def __repr__(self) -> str:
@@ -117,6 +121,11 @@ class Rendering(PictureData):
         """
         from clrecon.rendering.looks.colors import find_color
 
+        if self.drawing is not None:
+            below = replace(self, image=self.drawing.ground, drawing=None).with_background(color).image
+            return replace(
+                replace(self, drawing=None).with_background(color), drawing=Drawing(below, self.drawing.marks)
+            )
         behind = (255.0 * find_color(color)).astype(np.float32)
         alone = np.array([*np.rint(behind), 255], np.uint8).view(np.uint32)
         opacity = self.image[..., 3]
@@ -129,12 +138,26 @@ class Rendering(PictureData):
         return replace(self, image=image)
 
     @explains_arguments
-    def annotated(self, *, letters: bool = False, scale_bar: bool = False, caption: str | None = None) -> Rendering:
-        """Return the same picture with sides, a scale bar or a line, see ``clrecon.rendering.pictures.annotations``."""
+    def annotated(
+        self, *, letters: bool = False, scale_bar: bool = False, caption: str | None = None, dpi: float | None = None
+    ) -> Rendering:
+        """Return the same picture with sides, a scale bar or a line, see ``clrecon.rendering.pictures.annotations``.
+
+        Parameters
+        ----------
+        letters, scale_bar : bool
+        caption : str, optional
+        dpi : float, optional
+            Pixels per inch of the printed figure: text is 8 points high, and files of the picture have this resolution.
+            Default: text of a share of the picture.
+        """
         from clrecon.rendering.pictures.annotations import annotate
 
-        image = annotate(self, letters=letters, scale_bar=scale_bar, caption=caption)
-        return self if image is self.image else replace(self, image=image)
+        resolution = None if dpi is None else checked_dpi(dpi)
+        image, drawing = annotate(self, letters=letters, scale_bar=scale_bar, caption=caption, dpi=resolution)
+        if resolution is not None:
+            return replace(self, image=image, drawing=drawing, report={**self.report, "dpi": resolution})
+        return self if image is self.image else replace(self, image=image, drawing=drawing)
 
     @explains_arguments
     def save(self, path: str | os.PathLike[str], *, quality: int = 95, no_clobber: bool = False) -> int:
@@ -144,7 +167,8 @@ class Rendering(PictureData):
         ----------
         path : str or path
             ``.png`` and ``.tif`` keep the opacity; for parallel pictures they state the size of a pixel as resolution.
-            ``.png`` also states how the picture was made.  ``.jpg`` accepts opaque pictures only.
+            ``.png`` also states how the picture was made.  ``.jpg`` accepts opaque pictures only.  ``.svg`` has the
+            picture as PNG, and what `annotated` wrote on it as text and bars, which stay sharp and can be edited.
         quality : int
             Quality of JPEG, 1 to 100.
         no_clobber : bool
@@ -164,7 +188,7 @@ class Rendering(PictureData):
         """
 
         with keep_existing(keep=no_clobber):
-            return _replace_image(path, encode_image(self, check_image_path(path), quality))
+            return _replace_image(path, encode_image(self, check_image_path(path, has_vectors=True), quality))
 
     @explains_arguments
     def save_depth(self, path: str | os.PathLike[str], *, expected: bool = False, no_clobber: bool = False) -> int:
@@ -271,6 +295,7 @@ def merge_layers(rendering: Rendering, colors: NDArray[np.uint8], depth: NDArray
         expected_depth=_finite(_mean_way(shares, front, back)),
         values=None,
         report={**rendering.report, "merged_with_scene": True},
+        drawing=None,
     )
 
 
@@ -307,15 +332,35 @@ _MOST_PER_METRE = 2**31 - 1
 """Largest number of pixels per metre in a PNG file."""
 
 
-def check_image_path(path: str | os.PathLike[str]) -> str:
-    """Return the extension of a picture file in lower case."""
+_VECTOR_FORMAT = ".svg"
+"""Extension of files that hold annotations as text and bars."""
+
+_LEAST_DPI, _MOST_DPI = 36.0, 4800.0
+"""Resolutions of figures: below the first, text of 8 points has 4 pixels; printers end at the second."""
+
+
+def checked_dpi(dpi: Any) -> float:
+    """Return a resolution in pixels per inch, or refuse it."""
+    try:
+        value = float(dpi)
+    except (TypeError, ValueError, OverflowError):
+        value = 0.0
+    if not _LEAST_DPI <= value <= _MOST_DPI:
+        raise UsageError(f"a figure has {_LEAST_DPI:g} to {_MOST_DPI:,.0f} pixels per inch, not {dpi!r:.60}")
+    return value
+
+
+def check_image_path(path: str | os.PathLike[str], *, has_vectors: bool = False) -> str:
+    """Return the extension of a picture file in lower case; `has_vectors`: SVG too."""
     moves = str(path).lower().endswith((".gif", ".apng", ".mp4", ".webm"))
     hint = f" of animations, for which there is {name_parameter('turntable')}" if moves else ""
-    return find_extension(path, IMAGE_FORMATS, "picture", hint)
+    return find_extension(path, (*IMAGE_FORMATS, _VECTOR_FORMAT) if has_vectors else IMAGE_FORMATS, "picture", hint)
 
 
 def encode_image(rendering: PictureData, extension: str, quality: int = 95) -> bytes:
-    """Return the bytes of a file with an extension of `IMAGE_FORMATS`; the quality of JPEG is 1 to 100."""
+    """Return the bytes of a file of `IMAGE_FORMATS` or `_VECTOR_FORMAT`; the quality of JPEG is 1 to 100."""
+    if extension == _VECTOR_FORMAT:
+        return _encode_svg(rendering)
     load_pillow()
     from PIL import Image
 
@@ -328,9 +373,12 @@ def encode_image(rendering: PictureData, extension: str, quality: int = 95) -> b
         if not 1 <= quality <= 100:
             raise UsageError(f"the quality of a JPEG file lies between 1 and 100, not at {quality!r}")
         picture = picture.convert("RGB")
-        # No resolution: JFIF stores whole dots per inch, an error of 1 % at 0.5 mm.
+        # Not that of the pixels in mm: JFIF stores whole dots per inch, an error of 1 % at 0.5 mm.
         options = {"quality": quality, "subsampling": 0}
-    else:
+    dpi = rendering.report.get("dpi")
+    if dpi is not None:
+        options["dpi"] = (dpi, dpi)
+    elif kind != "JPEG":
         options.update(_resolution(rendering.pixel_mm))
     if kind == "PNG":
         options["pnginfo"] = _text_chunks(rendering)
@@ -375,24 +423,74 @@ def _resolution(pixel_mm: float | None) -> dict[str, Any]:
     return {"dpi": (25.4 / pixel_mm, 25.4 / pixel_mm)}
 
 
-def _text_chunks(rendering: PictureData) -> Any:
-    from PIL.PngImagePlugin import PngInfo
-
-    text = PngInfo()
-    text.add_text("Software", f"clrecon {package_version()}")
-    text.add_text("Mode", rendering.mode)
+def _describe_origin(rendering: PictureData) -> dict[str, str]:
+    """Return how a picture was made, as files say it by keywords."""
+    facts = {"Software": f"clrecon {package_version()}", "Mode": rendering.mode}
     camera = rendering.camera
     if camera is not None:
         from clrecon.rendering.pictures.annotations import orientation_letters
 
-        text.add_text("View", f"from {orientation_letters(-camera.basis().forward)}")
+        facts["View"] = f"from {orientation_letters(-camera.basis().forward)}"
         named = {"position": camera.position, "focal point": camera.focal_point, "up": camera.up}
         lines = [f"{name} {x:.6g} {y:.6g} {z:.6g}" for name, (x, y, z) in named.items()]
         if camera.parallel_scale is not None:
             lines.append(f"parallel scale {camera.parallel_scale:.6g} mm")
         else:
             lines.append(f"view angle {camera.view_angle:.6g} degrees")
-        text.add_text("Camera", f"LPS mm: {'; '.join(lines)}")
+        facts["Camera"] = f"LPS mm: {'; '.join(lines)}"
     if rendering.pixel_mm is not None:
-        text.add_text("Pixel", f"{rendering.pixel_mm:.6g} mm")
+        facts["Pixel"] = f"{rendering.pixel_mm:.6g} mm"
+    return facts
+
+
+def _text_chunks(rendering: PictureData) -> Any:
+    from PIL.PngImagePlugin import PngInfo
+
+    text = PngInfo()
+    for keyword, value in _describe_origin(rendering).items():
+        text.add_text(keyword, value)
     return text
+
+
+_SVG_ALIGN = {"l": "start", "m": "middle", "r": "end"}
+
+_SVG_FONTS = "Helvetica, Arial, 'Liberation Sans', sans-serif"
+"""Journals ask for the first; the others look alike where it is missing."""
+
+
+def _encode_svg(rendering: PictureData) -> bytes:
+    """Return an SVG file: the picture as PNG, and what was written on it as text and bars over it.
+
+    With a resolution its lengths are those of the printed figure, else a pixel is a pixel of the screen.
+    """
+    drawing = rendering.drawing or Drawing(rendering.image)
+    picture = base64.b64encode(encode_image(replace(rendering, image=drawing.ground), ".png")).decode("ascii")
+    height, width = drawing.ground.shape[:2]
+    dpi = rendering.report.get("dpi")
+    unit, side = ("", 1.0) if dpi is None else ("mm", 25.4 / dpi)
+    origin = "; ".join(f"{keyword}: {value}" for keyword, value in _describe_origin(rendering).items())
+    lines = [
+        '<?xml version="1.0" encoding="UTF-8"?>',
+        '<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink"'
+        f' width="{width * side:.6g}{unit}" height="{height * side:.6g}{unit}" viewBox="0 0 {width} {height}">',
+        f"<desc>{escape(origin)}</desc>",
+        f'<image width="{width}" height="{height}" xlink:href="data:image/png;base64,{picture}"/>',
+        f'<g font-family="{_SVG_FONTS}" paint-order="stroke" stroke-linejoin="round">',
+        *map(_draw_mark, drawing.marks),
+        "</g>",
+        "</svg>",
+        "",
+    ]
+    return "\n".join(lines).encode()
+
+
+def _draw_mark(mark: Text | Bar) -> str:
+    """Return a text or bar as an element of SVG; half of its stroke lies below what is filled."""
+    pen = f'fill="{mark.fill}"'
+    if mark.outline is not None:
+        pen += f' stroke="{mark.outline}" stroke-width="{2.0 * mark.stroke:g}"'
+    if isinstance(mark, Bar):
+        geometry = f'x="{mark.left:g}" y="{mark.top:g}" width="{mark.width:.6g}" height="{mark.height:g}"'
+        return f"<rect {geometry} {pen}/>"
+    geometry = f'x="{mark.x:g}" y="{mark.y:g}" font-size="{mark.size:.6g}" text-anchor="{_SVG_ALIGN[mark.align]}"'
+    return f"<text {geometry} {pen}>{escape(mark.text)}</text>"

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import chain
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
 from clrecon.rendering.looks.window import BONE_WINDOW, grey_image
-from clrecon.rendering.pictures.annotations import PictureData
+from clrecon.rendering.pictures.annotations import Drawing, PictureData, Text, text_pixels
 from clrecon.rendering.pictures.picture import Rendering
 from clrecon.rendering.pictures.pillow import load_font, load_pillow
 from clrecon.system.color_scale import ColorScale
 from clrecon.system.light_dataclass import dataclass, field, replace
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 SHEET_SIZE = (1600, 1200)
 """Default width and height of a contact sheet: twenty slices of about 300 pixels."""
@@ -182,7 +185,7 @@ def _draw_panel(panel: Panel, window: tuple[float, float], font: Any) -> Any:
     return picture
 
 
-_TEXT_SHARE, _SMALLEST_TEXT = 1 / 36, 9.0
+_TEXT_SHARE = 1 / 36
 
 
 def add_scale(picture: Rendering, scale: ColorScale, title: str) -> Rendering:
@@ -191,7 +194,7 @@ def add_scale(picture: Rendering, scale: ColorScale, title: str) -> Rendering:
     from PIL import Image, ImageDraw
 
     height = picture.image.shape[0]
-    text = max(_SMALLEST_TEXT, _TEXT_SHARE * height)
+    text = text_pixels(_TEXT_SHARE, height, picture.report.get("dpi"))
     font = load_font(text)
     names = [f"{tick:+g}" if scale.signed and tick else f"{tick:g}" for tick in scale.ticks]
     gap, bar = round(0.8 * text), round(1.4 * text)
@@ -206,12 +209,11 @@ def add_scale(picture: Rendering, scale: ColorScale, title: str) -> Rendering:
     colors[..., :3] = scale.colors(values)[:, None]
     strip.paste(Image.fromarray(colors), (gap, top))
     pen.rectangle((gap, top, gap + bar - 1, bottom - 1), outline="black", width=max(1, round(text / 14.0)))
-    for row, line in enumerate(lines):
-        pen.text((gap, gap + round(1.3 * text * row)), line, "black", font, "lt")
+    texts = [(gap, gap + round(1.3 * text * row), line, "lt") for row, line in enumerate(lines)]
     for tick, name in zip(scale.ticks, names, strict=True):
         tick_y = top + (scale.limit - tick) / (scale.limit - scale.low) * (bottom - 1 - top)
-        pen.text((gap + bar + gap // 2, tick_y), name, "black", font, "lm")
-    return replace(picture, image=np.concatenate([picture.image, np.array(strip)], axis=1))
+        texts.append((gap + bar + gap // 2, tick_y, name, "lm"))
+    return _add_strip(picture, strip, texts, font)
 
 
 def add_legend(picture: Rendering, labels: Sequence[tuple[str, str]]) -> Rendering:
@@ -220,7 +222,7 @@ def add_legend(picture: Rendering, labels: Sequence[tuple[str, str]]) -> Renderi
     from PIL import Image, ImageDraw
 
     height = picture.image.shape[0]
-    text = max(_SMALLEST_TEXT, _TEXT_SHARE * height)
+    text = text_pixels(_TEXT_SHARE, height, picture.report.get("dpi"))
     font = load_font(text)
     gap, line = round(0.8 * text), round(1.5 * text)
     room = max(1, (height - 2 * gap) // line)
@@ -228,8 +230,27 @@ def add_legend(picture: Rendering, labels: Sequence[tuple[str, str]]) -> Renderi
     wide = 2 * gap + line + max((font.getlength(name) for _, name in shown), default=0.0)
     strip = Image.new("RGBA", (round(wide), height), "white")
     pen = ImageDraw.Draw(strip)
+    texts = []
     for row, (color, name) in enumerate(shown):
         top = gap + row * line
         pen.rectangle((gap, top, gap + text, top + text), fill=color)
-        pen.text((gap + line, top + text / 2), name, "black", font, "lm")
-    return replace(picture, image=np.concatenate([picture.image, np.array(strip)], axis=1))
+        texts.append((gap + line, top + text / 2, name, "lm"))
+    return _add_strip(picture, strip, texts, font)
+
+
+def _add_strip(
+    picture: Rendering, strip: Image.Image, texts: Sequence[tuple[float, float, str, str]], font: Any
+) -> Rendering:
+    """Return a picture with a strip at its right: x, y, text and anchor of what is written in black on it."""
+    from PIL import ImageDraw
+
+    drawing = picture.drawing or Drawing(picture.image)
+    ground = np.concatenate([drawing.ground, np.array(strip)], axis=1)
+    pen = ImageDraw.Draw(strip)
+    marks = []
+    for x, y, text, anchor in texts:
+        pen.text((x, y), text, "black", font, anchor)
+        baseline = y + pen.textbbox((x, y), text, font, anchor)[1] - pen.textbbox((x, y), text, font, "ls")[1]
+        marks.append(Text(text, picture.size[0] + x, baseline, anchor[0], font.size))
+    image = np.concatenate([picture.image, np.array(strip)], axis=1)
+    return replace(picture, image=image, drawing=Drawing(ground, (*drawing.marks, *marks)))
