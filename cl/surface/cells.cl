@@ -9,6 +9,7 @@
 #include "surface/cell_numbers.h"
 #include "surface/grown.h"
 #include "surface/mc_tables.h"
+#include "surface/output_list.h"
 
 #ifndef LANES
 #define LANES 1
@@ -166,10 +167,117 @@ __kernel void list_words(
     }
 }
 
+#if LANES == 1
+/* Parameters  mask              in   (gk, gj, words)
+ *             active_words      in   (active,)
+ *             row_offsets       in   (3, rows_to_count)
+ *             word_vertices     in   (gk, gj, words)
+ *             word_triangles    in   (gk, gj, words)
+ *             vertex_list       out  (vertices,) and
+ *             triangle_list     out  (triangles,) entries, see output_list.h
+ *             vertex_blocks     out  (ceil(vertices / BLOCK),) and
+ *             triangle_blocks   out  (ceil(triangles / BLOCK),) place among the words with work of the word that has the
+ *                                    first number of each block
+ *             vertices, triangles   of the slab; no triangles are listed where trilinear.cl writes them
+ *             the others as for emit_triangles
+ * Launch      global = active rounded up by the host, any local; on GPUs alone
+ * Guarantees  every entry is written once; numbers of vertices inside cells, which are no word's, have NO_ENTRY */
+__kernel void list_output(
+    __global const uint *restrict mask, __global const uint *restrict active_words,
+    __global const uint *restrict row_offsets, __global const ushort *restrict word_vertices,
+    __global const ushort *restrict word_triangles,
+    __global uint *restrict vertex_list, __global uint *restrict vertex_blocks,
+    __global uint *restrict triangle_list, __global uint *restrict triangle_blocks,
+    const uint vertices, const uint triangles, const uint rows_to_count,
+    const uint gi, const uint gj, const uint gk, const uint words, const uint row_shift, const uint active
+    GROWN_PARAMETERS)
+{
+    const uint n = get_global_id(0);
+    if (n >= active)
+        return;
+    const uint row = active_words[n] >> row_shift, w = active_words[n] & ((1u << row_shift) - 1);
+    const uint k = row / gj, j = row - k * gj;
+    const size_t at = (size_t)row * words + w;
+    /* The word after it, where its numbers end. */
+    const int is_last = n + 1 == active;
+    const uint next = active_words[is_last ? n : n + 1];
+    const uint next_row = next >> row_shift;
+    const size_t next_at = (size_t)next_row * words + (next & ((1u << row_shift) - 1));
+    const grown_samples grown_here = GROWN_SAMPLES;
+    const uint kept = load_grown(&grown_here, row, w);
+
+    uint vertex = row_offsets[row] + word_vertices[at];
+    const uint vertices_end = is_last ? vertices : row_offsets[next_row] + word_vertices[next_at];
+    begin_blocks(vertex_blocks, vertex, vertices_end, n);
+    crossed_edges edges;
+    find_crossed_edges(&edges, mask, j, k, w, gi, gj, gk, words);
+    const uint x = (uint)edges.x & kept, y = (uint)edges.y & kept, z = (uint)edges.z & kept;
+    uint axes = 0, sample = 0, owners = x | y | z;
+    for (uint left = popcount(x) + popcount(y) + popcount(z); left != 0; --left, axes &= axes - 1) {
+        if (axes == 0) {
+            sample = lowest_bit(owners);
+            axes = (x >> sample & 1) | (y >> sample & 1) << 1 | (z >> sample & 1) << 2;
+            owners &= owners - 1;
+        }
+        vertex_list[vertex++] = make_entry(n, sample, lowest_bit(axes));
+    }
+    while (vertex < vertices_end)
+        vertex_list[vertex++] = NO_ENTRY;
+
+    if (triangles == 0)
+        return;
+    __global const uint *triangle_offsets = row_offsets + rows_to_count;
+    const uint first = triangle_offsets[0];
+    uint triangle = triangle_offsets[row] - first + word_triangles[at];
+    const uint triangles_end = is_last ? triangles : triangle_offsets[next_row] - first + word_triangles[next_at];
+    begin_blocks(triangle_blocks, triangle, triangles_end, n);
+    if (j + 1 >= gj || k + 1 >= gk)
+        return;
+    cell_rows rows;
+    load_cell_rows(&rows, mask, j, k, w, gj, words);
+    ulong corners = 0; /* of the triangles of cell `sample` that are still to come */
+    uint rest = find_active_cells(rows, w, gi) & kept;
+    for (uint left = 0; triangle < triangles_end; --left, corners >>= 12) {
+        if (left == 0) {
+            sample = lowest_bit(rest);
+            rest &= rest - 1;
+            corners = MC_TRIANGLES[cell_case(rows, sample)];
+            left = (uint)corners & 15;
+            corners >>= 4;
+        }
+        triangle_list[triangle++] = make_entry(n, sample, (uint)corners & 0xfff);
+    }
+}
+
+/* Write the triangle of a work-item; the shifts say where in an entry its first and its last corner stand. */
+#define TRIANGLE_PARAMETERS \
+    , __global const uint *restrict triangle_list, __global const uint *restrict triangle_blocks, const uint triangle_count
+#define EMIT_TRIANGLES(surface, first_shift, last_shift) \
+    emit_listed_triangle(surface, triangle_list, triangle_blocks, triangle_count, first_shift, last_shift, triangles)
+
+static inline void emit_listed_triangle(
+    const surface_bits *surface, __global const uint *triangle_list, __global const uint *triangle_blocks,
+    const uint triangle_count, const uint first_shift, const uint last_shift, __global uint *triangles)
+{
+    const uint triangle = get_global_id(0);
+    if (triangle >= triangle_count)
+        return;
+    const uint entry = triangle_list[triangle];
+    const uint word = surface->active_words[find_word(entry, triangle_blocks, triangle)];
+    const uint row = word >> surface->row_shift, w = word & ((1u << surface->row_shift) - 1);
+    const uint k = row / surface->gj, j = row - k * surface->gj, i = 32 * w + sample_of(entry);
+    vstore3((uint3)(number_edge(surface, entry >> first_shift & 15, i, j, k),
+        number_edge(surface, entry >> 4 & 15, i, j, k),
+        number_edge(surface, entry >> last_shift & 15, i, j, k)), triangle, triangles);
+}
+#else
+#define TRIANGLE_PARAMETERS , __global const ushort *restrict word_triangles
+#define EMIT_TRIANGLES(surface, first_shift, last_shift) \
+    emit_words(surface, row_offsets + rows_to_count, word_triangles, first_shift, last_shift, triangles)
+
 /* Write the triangles of a cell from number *triangle on; `packed` is its row of MC_TRIANGLES, and the shifts say where
- * in a packed triangle its first and its last corner stand.  On CPUs *waits triangles wait in private memory for their
- * turn, and the last ones for flush_triangles. */
-#if LANES > 1
+ * in a packed triangle its first and its last corner stand.  *waits triangles wait in private memory for their turn, and
+ * the last ones for flush_triangles. */
 #define TRIANGLES_WAITING 64
 
 static inline void flush_triangles(const uint *waiting, uint count, __global uint *out)
@@ -207,55 +315,22 @@ static inline void write_triangles(
         *waits = 0;
     }
 }
-#else
-#define TRIANGLES_WAITING 1 /* none */
-static inline void flush_triangles(const uint *waiting, uint count, __global uint *out) {}
 
-static inline void write_triangles(
-    const cell_numbers *edge_numbers, const ulong packed, const uint first_shift, const uint last_shift,
-    uint *waiting, uint *waits, size_t *triangle, __global uint *triangles)
+/* Write the triangles of the words of a work-item, cell by cell. */
+static inline void emit_words(
+    const surface_bits *surface, __global const uint *triangle_offsets, __global const ushort *word_triangles,
+    const uint first_shift, const uint last_shift, __global uint *triangles)
 {
-    for (uint n = 0; n < ((uint)packed & 15); ++n) {
-        const uint corners = (uint)(packed >> (4 + 12 * n));
-        vstore3((uint3)(pick_number(*edge_numbers, corners >> first_shift & 15),
-            pick_number(*edge_numbers, corners >> 4 & 15),
-            pick_number(*edge_numbers, corners >> last_shift & 15)), (*triangle)++, triangles);
-    }
-}
-#endif
-
-/* Parameters  mask              in   (gk, gj, words)
- *             active_words      in   (active,)
- *             row_offsets       in   (3, rows_to_count)
- *             word_vertices     in   (gk, gj, words)
- *             word_triangles    in   (gk, gj, words)
- *             triangles         out  (triangles, 3) vertex numbers, counter-clockwise as seen from lower values
- *             first_vertex      number of the slab's first vertex
- *             rows_to_count     rows that were counted
- *             gi gj gk, words   as above
- *             row_shift, active   as in cl/surface/marching_cubes.cl
- *             grown, first_grown   with -D GROWN: as for count_rows
- *             mirrored          1 when index space is left-handed in mm: the winding is turned round
- * Launch      global = ceil(active / WORDS_PER_ITEM) rounded up by the host, any local
- * Guarantees  every triangle is written once, cell by cell along the rows */
-__kernel void emit_triangles(
-    __global const uint *restrict mask, __global const uint *restrict active_words,
-    __global const uint *restrict row_offsets, __global const ushort *restrict word_vertices,
-    __global const ushort *restrict word_triangles,
-    __global uint *restrict triangles, const uint first_vertex, const uint rows_to_count,
-    const uint gi, const uint gj, const uint gk, const uint words, const uint row_shift, const uint active,
-    const int mirrored GROWN_PARAMETERS)
-{
+    const uint gi = surface->gi, gj = surface->gj, gk = surface->gk, words = surface->words;
+    const uint row_shift = surface->row_shift;
+    __global const uint *active_words = surface->active_words;
     const uint begin = get_global_id(0) * WORDS_PER_ITEM;
-    if (begin >= active)
+    if (begin >= surface->active)
         return;
-    const uint end = min(begin + WORDS_PER_ITEM, active);
-    const uint first_shift = mirrored ? 8 : 0, last_shift = mirrored ? 0 : 8;
-    const grown_samples grown_here = GROWN_SAMPLES;
+    const uint end = min(begin + WORDS_PER_ITEM, surface->active);
     uint waiting[3 * TRIANGLES_WAITING];
     uint waits = 0;
     const uint first_row = active_words[begin] >> row_shift;
-    __global const uint *triangle_offsets = row_offsets + rows_to_count;
     size_t triangle = (size_t)(triangle_offsets[first_row] - triangle_offsets[0])
         + word_triangles[(size_t)first_row * words + (active_words[begin] & ((1u << row_shift) - 1))];
     uint slice_begin = 0, slice_end = 0, k = 0;
@@ -270,11 +345,12 @@ __kernel void emit_triangles(
         if (j + 1 >= gj || k + 1 >= gk)
             continue;
         cell_rows rows, kept;
-        load_cell_rows(&rows, mask, j, k, w, gj, words);
-        load_grown_rows(&kept, &grown_here, j, k, w, gj);
+        load_cell_rows(&rows, surface->mask, j, k, w, gj, words);
+        load_grown_rows(&kept, &surface->grown, j, k, w, gj);
         uint rest = find_active_cells(rows, w, gi) & (uint)kept.y0z0;
         numbered_rows edges;
-        number_rows(&edges, &rows, &kept, mask, row_offsets, word_vertices, first_vertex, j, k, w, gi, gj, gk, words);
+        number_rows(&edges, &rows, &kept, surface->mask, surface->row_offsets, surface->word_vertices,
+            surface->first_vertex, j, k, w, gi, gj, gk, words);
         for (; rest != 0; rest &= rest - 1) {
             const uint b = lowest_bit(rest);
             cell_numbers edge_numbers;
@@ -285,4 +361,34 @@ __kernel void emit_triangles(
         }
     }
     flush_triangles(waiting, waits, triangles + 3 * triangle);
+}
+#endif
+
+/* Parameters  mask              in   (gk, gj, words)
+ *             active_words      in   (active,)
+ *             row_offsets       in   (3, rows_to_count)
+ *             word_vertices     in   (gk, gj, words)
+ *             triangles         out  (triangles, 3) vertex numbers, counter-clockwise as seen from lower values
+ *             first_vertex      number of the slab's first vertex
+ *             rows_to_count     rows that were counted
+ *             gi gj gk, words   as above
+ *             row_shift, active   as in cl/surface/marching_cubes.cl
+ *             word_triangles    in   (gk, gj, words); with LANES 1 in its place
+ *             triangle_list, triangle_blocks   in   of list_output
+ *             triangle_count    of the slab
+ *             grown, first_grown   with -D GROWN: as for count_rows
+ *             mirrored          1 when index space is left-handed in mm: the winding is turned round
+ * Launch      global = ceil(active / WORDS_PER_ITEM), with LANES 1 triangle_count; rounded up by the host, any local
+ * Guarantees  every triangle is written once, cell by cell along the rows */
+__kernel void emit_triangles(
+    __global const uint *restrict mask, __global const uint *restrict active_words,
+    __global const uint *restrict row_offsets, __global const ushort *restrict word_vertices,
+    __global uint *restrict triangles, const uint first_vertex, const uint rows_to_count,
+    const uint gi, const uint gj, const uint gk, const uint words, const uint row_shift, const uint active,
+    const int mirrored TRIANGLE_PARAMETERS GROWN_PARAMETERS)
+{
+    const uint first_shift = mirrored ? 8 : 0, last_shift = mirrored ? 0 : 8;
+    const surface_bits surface = {
+        mask, active_words, row_offsets, word_vertices, first_vertex, gi, gj, gk, words, row_shift, active, GROWN_SAMPLES};
+    EMIT_TRIANGLES(&surface, first_shift, last_shift);
 }

@@ -25,8 +25,9 @@
  *      (exclusive scan of all row counts: cl/primitives/scan.cl)
  *   2. total_counts       vertices, triangles and words with work of the slab
  *   3. list_words         the words with work, in order
- *   4. emit_vertices      positions and normals of the vertices of each word with work
- *   5. emit_triangles     vertex numbers of the triangles of each word with work
+ *      (on GPUs list_output: the word, the sample and the edges of each vertex and each triangle)
+ *   4. emit_vertices      positions and normals of the vertices of each word with work, on GPUs of each vertex
+ *   5. emit_triangles     vertex numbers of the triangles of each word with work, on GPUs of each triangle
  *
  * The sample grid is the volume, with one layer of outside around it when the surface is closed.  The passes work on
  * a slab of it: whole slices, with those beyond it that its vertices and their numbers depend on.  A mesh is the same
@@ -51,43 +52,68 @@
 #define WORDS_PER_ITEM 1
 #endif
 
-/* The vertices of a word, one after the other: 4 * sample + axis. */
 #if LANES == 1
+/* A work-item has one vertex, of the word that its entry in the list names: the loops below run once. */
+#include "surface/output_list.h"
+#define VERTEX_PARAMETERS \
+    , __global const uint *restrict vertex_list, __global const uint *restrict vertex_blocks, const uint vertices
+#define ITEM_VERTICES { vertex_list, vertex_blocks, vertices }
 typedef struct {
-    uint x, y, z, owners, sample, axes; /* owners that are still to come; the one before them, and its axes likewise */
-    uint left;
+    __global const uint *list, *blocks;
+    uint count;
+} item_vertices;
+
+/* Place among the words with work of the first word of the item; `active` if it has none. */
+static inline uint find_first_word(const item_vertices *item, const uint active)
+{
+    const uint vertex = get_global_id(0);
+    if (vertex >= item->count || item->list[vertex] == NO_ENTRY)
+        return active;
+    return find_word(item->list[vertex], item->blocks, vertex);
+}
+
+/* Number of the first vertex of the item; `first_of_word` is that of its first word. */
+static inline uint number_first(const item_vertices *item, const uint first_of_word) { return get_global_id(0); }
+
+/* The vertices of the item in a word, one after the other: 4 * sample + axis. */
+typedef struct {
+    uint vertex, left;
 } word_vertex_list;
 
-static inline void list_vertices(word_vertex_list *list, uint x, uint y, uint z)
+static inline void list_vertices(
+    word_vertex_list *list, const item_vertices *item, const uint x, const uint y, const uint z)
 {
-    list->x = x;
-    list->y = y;
-    list->z = z;
-    list->owners = x | y | z;
-    list->axes = 0;
-    list->left = popcount(x) + popcount(y) + popcount(z);
+    const uint entry = item->list[get_global_id(0)];
+    list->vertex = sample_of(entry) << 2 | (entry & 3);
+    list->left = 1;
 }
 
 static inline uint next_vertex(word_vertex_list *list)
 {
-    if (list->axes == 0) {
-        const uint b = lowest_bit(list->owners);
-        list->sample = b;
-        list->axes = (list->x >> b & 1) | (list->y >> b & 1) << 1 | (list->z >> b & 1) << 2;
-        list->owners &= list->owners - 1;
-    }
-    const uint axis = list->axes & 1 ? 0 : list->axes & 2 ? 1 : 2;
-    list->axes &= list->axes - 1;
     --list->left;
-    return 4 * list->sample + axis;
+    return list->vertex;
 }
 #else
+#define VERTEX_PARAMETERS
+#define ITEM_VERTICES { 0 }
+typedef struct {
+    int unused;
+} item_vertices;
+
+static inline uint find_first_word(const item_vertices *item, const uint active)
+{
+    return get_global_id(0) * WORDS_PER_ITEM;
+}
+
+static inline uint number_first(const item_vertices *item, const uint first_of_word) { return first_of_word; }
+
 typedef struct {
     ushort crossed[96];
     uint at, left;
 } word_vertex_list;
 
-static inline void list_vertices(word_vertex_list *list, uint x, uint y, uint z)
+static inline void list_vertices(
+    word_vertex_list *list, const item_vertices *item, const uint x, const uint y, const uint z)
 {
     /* Without branches: whether an axis has its vertex is as good as random, and wrong guesses cost more. */
     uint count = 0;
@@ -145,7 +171,9 @@ static inline uint next_vertex(word_vertex_list *list)
  *             biases          in   (highest label + 1,) with -D MASKS: see mask_border.h
  *             grown           in   (whole_gk, gj, words) with -D GROWN: the samples whose edges have vertices, see growing.cl
  *             first_grown     with -D GROWN: slice of them that the mask begins with
- * Launch      global = ceil(active / WORDS_PER_ITEM) rounded up by the host, any local
+ *             vertex_list, vertex_blocks   in   with LANES 1: of list_output
+ *             vertices        with LANES 1: number of vertices in the slab
+ * Launch      global = ceil(active / WORDS_PER_ITEM), with LANES 1 vertices; rounded up by the host, any local
  * Guarantees  every position and normal is written once.  Positions are right to one unit in the last place of the
  *             volume's largest coordinate (half a unit up to 4096 samples an axis, where products of a sample number
  *             and a step of 12 bits are exact; sums keep their error) */
@@ -159,9 +187,10 @@ void emit_vertices(
     const float iso_level, const VALUE outside, const float value_scale, const float4 margin,
     const int ni, const int nj, const int nk, const int border, const int first_slice, const int first_sample_slice,
     const uint gk, const uint words, const uint row_shift, const uint active
-    BORDER_PARAMETERS RANGE_PARAMETERS GROWN_PARAMETERS)
+    VERTEX_PARAMETERS BORDER_PARAMETERS RANGE_PARAMETERS GROWN_PARAMETERS)
 {
-    const uint begin = get_global_id(0) * WORDS_PER_ITEM;
+    const item_vertices item = ITEM_VERTICES;
+    const uint begin = find_first_word(&item, active);
     if (begin >= active)
         return;
     const uint end = min(begin + WORDS_PER_ITEM, active);
@@ -198,7 +227,7 @@ void emit_vertices(
             if (gathered != 0)
                 write_vertices(&group, &frame, gathered, positions + 3 * written, normals + 3 * written);
             gathered = 0;
-            written = row_offsets[row] + word_vertices[(size_t)row * words + w];
+            written = number_first(&item, row_offsets[row] + word_vertices[(size_t)row * words + w]);
             k = row / gj;
             slice_begin = k * gj;
             slice_end = slice_begin + gj;
@@ -210,7 +239,7 @@ void emit_vertices(
         const uint kept = load_grown(&grown_here, row, w);
         const uint x = (uint)edges.x & kept, y = (uint)edges.y & kept, z = (uint)edges.z & kept;
         word_vertex_list list;
-        list_vertices(&list, x, y, z);
+        list_vertices(&list, &item, x, y, z);
         const int vi = (int)(32 * w) - border, vj = (int)j - border, vk = (int)k + first_sample_slice - border;
         const int row_is_inner = vj >= 1 && vj < nj - 2 && vk >= 1 && vk < nk - 2;
         while (list.left != 0) {

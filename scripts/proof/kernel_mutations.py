@@ -18,10 +18,12 @@ SKIPS = {"every 7th item": "get_global_id(0) % 7u == 3u", "items beyond 500": "g
 
 ONE_GROUP = "it is launched over one work-group of 64 items, whatever the data"
 ONE_ITEM = "its only work-item with something to do is the first"
+ON_GPUS = "CPUs do not launch it: RUSTICL_DEVICE_TYPE=gpu makes a device that does"
 EQUIVALENT = {
     ("scan_block_sums", "items beyond 500"): ONE_GROUP,
     ("total_counts", "every 7th item"): ONE_ITEM,
     ("total_counts", "items beyond 500"): ONE_ITEM,
+    **{("list_output", name): ON_GPUS for name in (*SKIPS, "inverted vertices", "inverted triangles")},
     ("find_first_edges", "inverted dirty"): "vertices beside which nothing has changed are looked at again",
 }
 """Mutations that change nothing, with the reason."""
@@ -245,6 +247,10 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
     },
     "total_counts": {"totals": (("totals[which] = (", "totals[which] = -("),)},
     "list_words": {"words": (("+ lowest_bit(flags);", "+ 31 - lowest_bit(flags);"),)},
+    "list_output": {
+        "vertices": (("make_entry(n, sample, lowest_bit(axes));", "~make_entry(n, sample, lowest_bit(axes));"),),
+        "triangles": (("make_entry(n, sample, (uint)corners", "~make_entry(n, sample, (uint)corners"),),
+    },
     "emit_vertices": {
         "positions": (("store_triples(PLACE(x), PLACE(y), PLACE(z)", "store_triples(-PLACE(x), -PLACE(y), -PLACE(z)"),),
         "normals": (

@@ -284,8 +284,7 @@ class Extraction:
 
     def _check_output(self, slab: Slab, counted: Counted) -> None:
         """Refuse a slab whose mesh does not fit beside the other buffers; record the memory of the slab."""
-        needs = slab.needs(counted.output())
-        needs["active words"] = 4 * counted.active_words
+        needs = {**slab.needs(counted.output()), **counted.scratch(self.device)}
         bricks_size = self.resident.kept_bytes(BRICKS)
         if slab.is_whole and bricks_size:
             needs[BRICKS] = bricks_size

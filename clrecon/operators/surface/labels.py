@@ -135,8 +135,8 @@ class ExtractionByLabel(Generic[Held, Made]):
 
     def check_output(self, window: Window, counted: Counted) -> None:
         """Refuse a mesh that does not fit beside the other buffers; record the memory of the label."""
-        needs, scratch = self._needs(window), window.scratch()
-        output = counted.output()
+        scratch = {**window.scratch(), **counted.scratch(self.device)}
+        needs, output = {**self._needs(window), **scratch}, counted.output()
         ocl.check_budget(self.device, {**needs, **output}, self.memory, less_may_fit=True)
         self.device_bytes = {
             "volume": sum(needs.values()) - sum(scratch.values()),

@@ -5,6 +5,7 @@ slab.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -57,6 +58,17 @@ class Classified:
 
 
 @dataclass(frozen=True)
+class OutputList:
+    """For GPUs, on the device: the word, the sample and the edges of each vertex and triangle, see cl/surface/
+    output_list.h."""
+
+    vertices_d: Any
+    vertex_blocks_d: Any
+    triangles_d: Any
+    triangle_blocks_d: Any
+
+
+@dataclass(frozen=True)
 class Counted:
     """Results of `count` for a slab, on the device, and totals of its own rows; `cells` of the trilinear field."""
 
@@ -74,6 +86,60 @@ class Counted:
     def output(self) -> dict[str, int]:
         """Bytes of the slab's mesh."""
         return {"vertices": 24 * self.vertices, "triangles": 12 * self.triangles}
+
+    def scratch(self, device: Device) -> dict[str, int]:
+        """Bytes of the buffers whose sizes are known once the slab is counted."""
+        numbers = (self.vertices, self.triangles) if has_lanes(device) else ()
+        return {"active words": 4 * self.active_words, "list of the output": sum(4 * (n + _blocks(n)) for n in numbers)}
+
+    @property
+    def word_arguments(self) -> dict[str, Any]:
+        """Arguments about the words with work, for kernels that write a mesh."""
+        return {
+            "mask": self.classified.mask_d,
+            "active_words": self.active_words_d,
+            "row_offsets": self.row_offsets_d,
+            "word_vertices": self.word_vertices_d,
+            "row_shift": self.slab.grid.row_shift,
+            "active": self.active_words,
+            **self.classified.own,
+        }
+
+    @property
+    def cell_arguments(self) -> dict[str, Any]:
+        """The same, and the size of the slab, for kernels of cl/surface/cells.cl."""
+        slab = self.slab
+        gi, gj, _ = slab.grid.shape
+        size = {"gi": gi, "gj": gj, "gk": slab.mask_slices, "words": slab.grid.words}
+        return {**self.word_arguments, **size, "rows_to_count": slab.counted_rows}
+
+
+BLOCK = ocl.kernel_constant("surface/output_list.h", "BLOCK")
+"""Entries of the list of the output for which the place of a word is noted."""
+
+
+def _blocks(entries: int) -> int:
+    return -(-entries // BLOCK)
+
+
+def has_lanes(device: Device) -> bool:
+    """True where each work-item is a lane of its own, on GPUs: it writes one vertex or one triangle."""
+    return device.kernel_variants["LANES"] == "1"
+
+
+def list_output(device: Device, counted: Counted) -> OutputList:
+    """Find what each work-item of a GPU writes; no triangles where cl/surface/trilinear.cl writes them."""
+    vertices, triangles = counted.vertices, counted.triangles if counted.cells is None else 0
+    vertices_d, vertex_blocks_d, triangles_d, triangle_blocks_d = (
+        ocl.allocate(device, 4 * entries) for entries in (vertices, _blocks(vertices), triangles, _blocks(triangles))
+    )
+    ocl.launch(
+        device, load_cells(device, grown=counted.classified.is_part)["list_output"], counted.active_words,
+        word_triangles=counted.word_triangles_d, vertex_list=vertices_d, vertex_blocks=vertex_blocks_d,
+        triangle_list=triangles_d, triangle_blocks=triangle_blocks_d, vertices=vertices, triangles=triangles,
+        **counted.cell_arguments,
+    )  # fmt: skip
+    return OutputList(vertices_d, vertex_blocks_d, triangles_d, triangle_blocks_d)
 
 
 def count(device: Device, slab: Slab, classified: Classified, voxels_d: Any = None) -> Counted:
@@ -253,33 +319,38 @@ class Emission:
         self._device, self._stopwatch = device, stopwatch
         self._program, self._voxels_d = program, voxels_d
         self._counted, self._placement = counted, placement
-        slab, classified = self._slab, self._classified = counted.slab, counted.classified
+        self._slab = slab = counted.slab
         self.frames_d = ocl.upload(device, placement.slice_frames[slab.first : slab.first + slab.mask_slices])
         self.steps_d = ocl.upload(device, placement.steps)
         self._positions, self.positions_d = ocl.empty_output(device, (counted.vertices, 3), np.float32)
         self._normals, self.normals_d = ocl.empty_output(device, (counted.vertices, 3), np.float32)
         self._triangles, self.triangles_d = ocl.empty_output(device, (counted.triangles, 3), np.uint32)
-        self._common = {
-            "mask": classified.mask_d,
-            "active_words": counted.active_words_d,
-            "row_offsets": counted.row_offsets_d,
-            "word_vertices": counted.word_vertices_d,
-            "row_shift": slab.grid.row_shift,
-            "active": counted.active_words,
-        }
-        self._items = -(-counted.active_words // int(device.kernel_variants["WORDS_PER_ITEM"]))
+
+    @cached_property
+    def _listed(self) -> OutputList | None:
+        return list_output(self._device, self._counted) if has_lanes(self._device) else None
+
+    @property
+    def _shares(self) -> int:
+        """Work-items that have some words each, on a CPU."""
+        return -(-self._counted.active_words // int(self._device.kernel_variants["WORDS_PER_ITEM"]))
 
     def vertices(self, iso_level: float, **label_arguments: Any) -> None:
         """Launch the writing of positions and normals, with those of labels; it may be repeated at another level."""
-        if not self._counted.vertices:
+        counted = self._counted
+        if not counted.vertices:
             return
         rule = self._slab.grid.rule
         upper = {} if rule.upper_level is None else {"upper_level": rule.upper_level, "highest": rule.highest_inside}
+        items, lists = self._shares, {}
+        if (listed := self._listed) is not None:
+            items = counted.vertices
+            lists = {"vertex_list": listed.vertices_d, "vertex_blocks": listed.vertex_blocks_d, "vertices": items}
         ocl.launch(
-            self._device, self._program["emit_vertices"], self._items,
+            self._device, self._program["emit_vertices"], items,
             voxels=self._voxels_d, **self.tables, positions=self.positions_d, normals=self.normals_d,
             iso_level=iso_level, outside=rule.outside, value_scale=rule.value_scale,
-            **self._slab.arguments, **self._common, **self._classified.own, **label_arguments, **upper,
+            **self._slab.arguments, **counted.word_arguments, **lists, **label_arguments, **upper,
         )  # fmt: skip
 
     @property
@@ -289,16 +360,18 @@ class Emission:
 
     def triangles(self, first_vertex: int = 0) -> None:
         """Launch the writing of triangles; `first_vertex` is the number of vertices of all earlier slabs."""
-        if not self._counted.triangles:
+        counted = self._counted
+        if not counted.triangles:
             return
-        slab, counted = self._slab, self._counted
-        gi, gj, _ = slab.grid.shape
-        program = load_cells(self._device, grown=self._classified.is_part)
+        items, lists = self._shares, {"word_triangles": counted.word_triangles_d}
+        if (listed := self._listed) is not None:
+            items = counted.triangles
+            lists = {"triangle_list": listed.triangles_d, "triangle_blocks": listed.triangle_blocks_d}
+            lists["triangle_count"] = items
         ocl.launch(
-            self._device, program["emit_triangles"], self._items,
-            word_triangles=counted.word_triangles_d, triangles=self.triangles_d, first_vertex=first_vertex,
-            rows_to_count=slab.counted_rows, gi=gi, gj=gj, gk=slab.mask_slices, words=slab.grid.words,
-            mirrored=slab.grid.winds_backwards, **self._common, **self._classified.own,
+            self._device, load_cells(self._device, grown=counted.classified.is_part)["emit_triangles"], items,
+            triangles=self.triangles_d, first_vertex=first_vertex, mirrored=self._slab.grid.winds_backwards,
+            **lists, **counted.cell_arguments,
         )  # fmt: skip
 
     def run(
@@ -311,7 +384,7 @@ class Emission:
                 self.triangles(first_vertex)
             else:
                 output = {"positions": self.positions_d, "normals": self.normals_d, "triangles": self.triangles_d}
-                field = {"voxels": self._voxels_d, "mask": self._classified.mask_d}
+                field = {"voxels": self._voxels_d, "mask": self._counted.classified.mask_d}
                 emit_cells(self._device, self._slab, field, self._counted, self.tables, output, first_vertex)
         return self.download()
 

@@ -54,7 +54,7 @@ _VERTEX_TOLERANCE_VOXEL = 1e-4
 _NORMAL_TOLERANCE = 2e-4
 """Largest difference of unit vectors: near a saddle a gradient is a small difference of float32."""
 
-_MARCHING = ("count_rows", "total_counts", "list_words", "emit_vertices", "emit_triangles")
+_MARCHING = ("count_rows", "total_counts", "list_words", "list_output", "emit_vertices", "emit_triangles")
 """Kernels that every surface launches."""
 
 LONG = (532, 2, 6)
