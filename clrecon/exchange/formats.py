@@ -11,7 +11,7 @@ Nothing here loads numpy or the module of a format before a file is written or r
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
 from importlib import import_module
 from pathlib import Path
@@ -37,7 +37,7 @@ class FileFormat:
 
     The module, imported when it is needed, has `estimate` (bytes of a file, exact or rather too small), `write`,
     `verify` (reads the file back, and raises `OutputError` unless sizes and counts are those of the contents),
-    `read_mesh` and `read_cloud`.
+    `read_mesh` and `read_cloud`, and where a mesh can be written `in_pieces`, `write_pieces`.
 
     most_bytes: Largest file that the format, or common readers of it, can handle.
     """
@@ -47,6 +47,7 @@ class FileFormat:
     clouds: bool = False
     is_read: bool = True
     holds_many: bool = False
+    in_pieces: bool = False
     most_bytes: int = NO_LIMIT
 
     @property
@@ -56,8 +57,8 @@ class FileFormat:
 
 # STL: the format could hold more, but many programs keep offsets in 32 bits.  GLB: its length field has 32 bits.
 _REGISTRY = {
-    ".stl": FileFormat(module="stl", meshes=True, most_bytes=_FOUR_GIB),
-    ".ply": FileFormat(module="ply", meshes=True, clouds=True),
+    ".stl": FileFormat(module="stl", meshes=True, in_pieces=True, most_bytes=_FOUR_GIB),
+    ".ply": FileFormat(module="ply", meshes=True, clouds=True, in_pieces=True),
     ".obj": FileFormat(module="obj", meshes=True, holds_many=True),
     ".glb": FileFormat(module="glb", meshes=True, holds_many=True, most_bytes=_FOUR_GIB),
     ".vtp": FileFormat(module="vtp", meshes=True, clouds=True, holds_many=True),
@@ -71,6 +72,7 @@ _REGISTRY = {
 
 FORMATS = {extension: own for extension, own in _REGISTRY.items() if own.meshes}
 CLOUD_FORMATS = {extension: own for extension, own in _REGISTRY.items() if own.clouds}
+IN_PIECES = tuple(extension for extension, own in FORMATS.items() if own.in_pieces)
 ASSEMBLIES = tuple(extension for extension, own in FORMATS.items() if own.holds_many)
 MESH_INPUTS = tuple(extension for extension, own in FORMATS.items() if own.is_read)
 CLOUD_INPUTS = (*CLOUD_FORMATS, ".csv", ".txt", ".asc")
@@ -82,9 +84,17 @@ def list_extensions(extensions: Sequence[str]) -> str:
 
 
 def stage_content(
-    content: PointContent | Assembly, path: str | os.PathLike[str], chosen: FileFormat, counted: str, others: str
+    content: PointContent | Assembly,
+    path: str | os.PathLike[str],
+    chosen: FileFormat,
+    counted: str,
+    others: str,
+    pieces: Iterable[Content] | None = None,
 ) -> AbstractContextManager[StagedFile]:
-    """Write contents under a temporary name (`stage_file`); `counted`, `others` are words in a message of its limit."""
+    """Write contents under a temporary name (`stage_file`); `counted`, `others` are words in a message of its limit.
+
+    pieces: The contents piece by piece; `content` then has their counts alone.
+    """
     code = chosen.code
     expected_bytes = code.estimate(content)
     if expected_bytes > chosen.most_bytes:
@@ -95,7 +105,7 @@ def stage_content(
         )
     return stage_file(
         path,
-        lambda stream: code.write(stream, content),
+        lambda stream: code.write(stream, content) if pieces is None else code.write_pieces(stream, content, pieces),
         lambda temporary: code.verify(temporary, content),
         expected_bytes=expected_bytes,
     )
@@ -131,6 +141,27 @@ def stage_assembly(
         raise NoSurfaceError("the surfaces are empty: no file is written")
     count = sum(mesh.triangle_count for mesh in meshes)
     return stage_content(content, path, FORMATS[extension], f"{count} triangles", "fewer labels")
+
+
+def stage_pieces(
+    whole: Content, pieces: Iterable[Content], path: str | os.PathLike[str]
+) -> AbstractContextManager[StagedFile]:
+    """Write a mesh as `stage_mesh` does, a piece at a time, none of which is kept.
+
+    whole: Facts and counts: its arrays have the shapes of all pieces together, and may take no memory.
+    pieces: In the order of the file: their triangles refer to vertices of the whole, of their own piece and the next.
+    """
+    count = len(whole.triangles)
+    return stage_content(whole, path, FORMATS[check_format(path)], f"{count} triangles", "PLY", pieces)
+
+
+def check_in_pieces(path: str | os.PathLike[str]) -> None:
+    """Refuse a file whose format needs the whole mesh before its first byte."""
+    extension = check_format(path)
+    if extension not in IN_PIECES:
+        raise UsageError(
+            f"{extension} needs the whole mesh in memory: in pieces are written {list_extensions(IN_PIECES)}"
+        )
 
 
 def check_format(path: str | os.PathLike[str]) -> str:

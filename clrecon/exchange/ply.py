@@ -17,7 +17,7 @@ from __future__ import annotations
 import io
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -100,16 +100,42 @@ def estimate(content: PointContent) -> int:
 
 def write(stream: BinaryIO, content: PointContent) -> None:
     """Write vertices, with what is known of each, and the faces of a mesh."""
+    _write_head(stream, content)
+    _write_vertices(stream, content)
+    if isinstance(content, Content):
+        _write_faces(stream, content)
+
+
+def write_pieces(stream: BinaryIO, whole: Content, pieces: Iterable[Content]) -> None:
+    """Write what `write` writes, a piece at a time: its vertices and its faces go to two places of the file."""
+    _write_head(stream, whole)
+    next_vertex = stream.tell()
+    next_face = next_vertex + _vertex(whole).itemsize * len(whole.vertices)
+    for piece in pieces:
+        stream.seek(next_vertex)
+        _write_vertices(stream, piece)
+        next_vertex = stream.tell()
+        stream.seek(next_face)
+        _write_faces(stream, piece)
+        next_face = stream.tell()
+
+
+def _write_head(stream: BinaryIO, content: PointContent) -> None:
     if len(content.vertices) > 2**31:
         raise OutputError(f"{len(content.vertices)} vertices are too many for a PLY file, at most {2**31}")
     stream.write(_header(content))
+
+
+def _write_vertices(stream: BinaryIO, content: PointContent) -> None:
     columns = {name: values for name, (values, _, _) in _columns(content).items()}
     _write_rows(stream, np.empty(_CHUNK, dtype=_vertex(content)), columns, len(content.vertices))
-    if isinstance(content, Content):
-        faces = np.empty(_CHUNK, dtype=_face(content))
-        faces["count"] = 3
-        numbers = {f"scalar_{name}": values for name, values in content.face_values.items()}
-        _write_rows(stream, faces, {"corners": content.triangles, **numbers}, len(content.triangles))
+
+
+def _write_faces(stream: BinaryIO, content: Content) -> None:
+    faces = np.empty(_CHUNK, dtype=_face(content))
+    faces["count"] = 3
+    numbers = {f"scalar_{name}": values for name, values in content.face_values.items()}
+    _write_rows(stream, faces, {"corners": content.triangles, **numbers}, len(content.triangles))
 
 
 def _write_rows(stream: BinaryIO, rows: NDArray[Any], columns: Mapping[str, NDArray[Any]], count: int) -> None:

@@ -187,13 +187,18 @@ def scheduler_option(text: str, **how: Any) -> Any:
     return option("--scheduler ADDRESS", text, parse=check_address, **how)
 
 
-def refuse_changed(settings: Any, names: Sequence[str], scheduler: str | None) -> None:
-    """Refuse settings of surfaces that are made in one piece where they are shared out."""
+def refuse_changed(settings: Any, names: Sequence[str], reason: str) -> None:
+    """Refuse settings that are not their defaults, for a `reason`."""
     defaults = {field.name: field.default for field in fields(settings)}
-    given = [name_parameter(name) for name in names if getattr(settings, name) != defaults[name]]
+    given = [name_parameter(name) for name in names if getattr(settings, name) not in (defaults[name], [])]
     if given:
-        asked = name_parameter("device", ALL_DEVICES) if scheduler is None else name_parameter("scheduler", scheduler)
-        raise UsageError(f"{asked} shares out plain surfaces: leave out {' and '.join(given)}")
+        raise UsageError(f"{reason}: leave out {' and '.join(given)}")
+
+
+def describe_sharing(scheduler: str | None) -> str:
+    """Say why surfaces that are made in one piece are refused where they are shared out."""
+    asked = name_parameter("device", ALL_DEVICES) if scheduler is None else name_parameter("scheduler", scheduler)
+    return f"{asked} shares out plain surfaces"
 
 
 def view_option(values: str, text: str, **how: Any) -> Any:

@@ -12,10 +12,10 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 99_548,
-    "modules": 436,
+    "lines": 99_986,
+    "modules": 437,
     "small_modules_with_one_reader": 8,
-    "docstrings_with_raises": 137,
+    "docstrings_with_raises": 138,
     "options_in_several_files": 8,
     "modules_with_own_all": 0,
 }
@@ -28,7 +28,7 @@ HABITS = {
     "nested_conditionals": 0,
     "comprehensions_of_two_loops": 23,
     "positional_flags": 0,
-    "functions_of_many_parameters": 28,
+    "functions_of_many_parameters": 29,
     "equal_functions": 0,
     "constants_of_one_file": 0,
     "kernels_with_branches": 0,

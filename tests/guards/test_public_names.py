@@ -21,7 +21,8 @@ KEYWORDS = ("device", "memory", "progress")
 TAKE_PROGRESS = {
     "write_volume",
     "Mask.from_band", "SurfaceExtractor.extract_vertices", "extract_points",
-    "SurfaceExtractor.extract", "VolumeRenderer.render", "choose_iso_value", "cluster_points", "collapse_quadric",
+    "SurfaceExtractor.extract", "SurfaceExtractor.save",
+    "VolumeRenderer.render", "choose_iso_value", "cluster_points", "collapse_quadric",
     "compare_meshes", "extract_by_method",
     "cut_slice", "decimate_mesh", "denoise_points", "estimate_normals", "extract_isosurface", "extract_isosurfaces",
     "extract_label_masks", "extract_labels", "fill_enclosed", "filter_bilateral", "filter_volume",

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from clrecon.exchange.formats import check_assembly, describe_rounding
+from clrecon.errors import UsageError
+from clrecon.exchange.formats import check_assembly, check_in_pieces, describe_rounding
 from clrecon.geometry import frame_from_lps
 from clrecon.jobs.mesh.bone import judge_surfaces, warn_of_walls
 from clrecon.jobs.mesh.labels import describe_label, judge_label_volumes, name_label_files
@@ -17,10 +18,11 @@ from clrecon.jobs.mesh.make import MadeParts, first_names, label_parts, make_par
 from clrecon.jobs.mesh.purposes import describe_purposes
 from clrecon.jobs.mesh.refinement import judge_parts, place_on_cortex, refine_and_measure, warn_of_gates, warn_of_shift
 from clrecon.jobs.mesh.settings import MeshSettings
-from clrecon.jobs.mesh.surfaces import Part, describe_level, plan_surfaces
+from clrecon.jobs.mesh.surfaces import Part, Surface, describe_level, plan_surfaces, warn_of_contrast
 from clrecon.jobs.outputs import check_kept, check_outputs, count_leftovers, name_outputs, refuse_files, refuse_numbered
 from clrecon.jobs.presets import find_iso_preset
 from clrecon.jobs.run import ArchiveTarget, Run, RunReport
+from clrecon.system.arguments import name_parameter
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.log import get_logger
 from clrecon.system.paths import extension_of
@@ -28,9 +30,13 @@ from clrecon.system.pieces import find_bounds
 from clrecon.system.text import count_of
 
 if TYPE_CHECKING:
+    from clrecon.geometry import Volume
     from clrecon.labels import LabelMap
     from clrecon.mesh import Mesh
+    from clrecon.opencl import Device
+    from clrecon.operators.resident.device_volume import DeviceVolume
     from clrecon.system.files import StagedFile
+    from clrecon.system.progress import Progress
 
 
 _OF_ONE = ("quality", "walls", "iso_distance", "cortex", "refinement", "print", "cells", "growing")
@@ -265,6 +271,8 @@ def make_mesh(
     store: URL of a DICOMweb archive that gets the meshes too, before any file is in its place.
     """
     settings = settings or MeshSettings()
+    if settings.by_slabs:
+        return _pass_meshes(source, output, settings, report_path, store, **how)
     if settings.all_parts and makes_objects(output):
         settings = replace(settings, split=True, one_file=True)
     with Run(settings, **how) as run:
@@ -319,11 +327,106 @@ def make_mesh(
         stored = None if target is None else target.store_meshes(meshes, is_modified=is_modified)
         report = report_of(run, result, entries, gates, [*left, *walls, *warnings], stored)
         run.finish(report, report_path)
+    return _log_report(report)
+
+
+def _log_report(report: MeshReport) -> MeshReport:
     log.info(
         "%d meshes made, %d triangles, %d slabs, on %s in %.3f s",
         *(len(report.meshes), report.triangles, report.slabs, report.device, report.seconds["total"]),
     )
     return report
+
+
+class _PassingMeshes:
+    """Surfaces that are written slab by slab as they are made, and never lie whole in memory."""
+
+    def __init__(self, run: Run, output: str | Path):
+        self._run, self._output = run, output
+        self._facts: list[dict[str, Any]] = []
+        self.paths: list[str | Path] = []
+        self.files: list[StagedFile] = []
+
+    def extract(
+        self,
+        volume: Volume,
+        surfaces: Sequence[Surface],
+        device: Device,
+        settings: MeshSettings,
+        progress: Progress,
+        labels: LabelMap | None = None,
+    ) -> list[Mesh]:
+        """Write all surfaces; return for each a mesh without triangles, with its report."""
+        from clrecon.operators.resident.device_volume import DeviceVolume
+
+        self.paths = name_outputs(self._output, [surface.name for surface in surfaces])
+        with DeviceVolume(volume, device=device, memory=settings.memory) as resident:
+            return [self._write(resident, *each) for each in zip(surfaces, self.paths, strict=True)]
+
+    def _write(self, resident: DeviceVolume, surface: Surface, path: str | Path) -> Mesh:
+        import numpy as np
+
+        from clrecon.mesh import Mesh
+        from clrecon.mesh.written_parts import PartsFile
+        from clrecon.operators.surface.spans import PassingSurface
+
+        run, settings = self._run, self._run.settings
+        passing = PassingSurface(
+            resident, surface.iso_value, closed=settings.closed, topology=settings.topology, below=surface.below,
+            vertex_rule=settings.vertex_rule, progress=run.progress,
+        )  # fmt: skip
+
+        def timed_parts() -> Iterator[Any]:
+            for part in passing.parts(run.progress):
+                run.lap("surface")
+                yield part
+                run.lap("write")
+
+        counts, frame = (passing.vertices, passing.triangles), frame_from_lps(settings.space)
+        file = PartsFile(path, settings.space, keep_ids=settings.keep_ids)
+        self.files.append(run.stage(file.stage(timed_parts(), counts, passing.describe())))
+        ends = passing.bounds @ frame.T
+        self._facts.append(
+            {
+                "vertices": passing.vertices,
+                "triangles": passing.triangles,
+                "bounds_mm": [ends.min(axis=0).tolist(), ends.max(axis=0).tolist()],
+                **dict.fromkeys(("iso_distance", "refinement", "walls", "print")),
+            }
+        )
+        none = np.empty((0, 3), np.float32)
+        return Mesh(none, none.astype(np.uint32), none, passing.describe())
+
+    def complete(self, parts: Sequence[Part]) -> None:
+        """Give the parts what their meshes without triangles do not tell, for their entries in the report."""
+        for part, facts in zip(parts, self._facts, strict=True):
+            part.facts |= facts
+
+
+def _pass_meshes(
+    source: str | Path,
+    output: str | Path,
+    settings: MeshSettings,
+    report_path: str | Path | None,
+    store: str | None,
+    **how: Any,
+) -> MeshReport:
+    """Do what `make_mesh` does with surfaces that are written slab by slab, and never measured."""
+    if store is not None:
+        raise UsageError(f"an archive takes whole meshes: leave {name_parameter('by_slabs', True)} out")
+    check_in_pieces(output)
+    with Run(settings, **how) as run:
+        surfaces = plan_surfaces(settings.levels, below=settings.below is not None)
+        with run.keeping():
+            check_kept(check_outputs(output, report_path, first_names(surfaces, split=False)), source)
+        passing = _PassingMeshes(run, output)
+        result = make_parts(source, run, extract=passing.extract)
+        passing.complete(result.parts)
+        written = zip(result.parts, passing.files, passing.paths, strict=True)
+        entries = [describe_part(*each, settings.space) for each in written]
+        report = report_of(run, result, entries, [], [] if result.choice is None else warn_of_contrast(result.choice))
+        run.finish(report, report_path)
+    return _log_report(report)
 
 
 def makes_objects(output: str | Path) -> bool:

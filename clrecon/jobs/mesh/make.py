@@ -62,8 +62,17 @@ class MadeParts:
     origins: list[dict[str, Any]]
 
 
-def make_parts(source: str | Path, run: Run, check_map: Callable[[LabelMap], None] | None = None) -> MadeParts:
-    """Read a scan, extract its surfaces and select components; `check_map` gets the label map before any work."""
+def make_parts(
+    source: str | Path,
+    run: Run,
+    check_map: Callable[[LabelMap], None] | None = None,
+    extract: Callable[..., list[Mesh]] | None = None,
+) -> MadeParts:
+    """Read a scan, extract its surfaces and select components.
+
+    check_map: Gets the label map before any work.
+    extract: In place of `extract_surfaces`.
+    """
     settings: MeshSettings = run.settings
     (volume, labels), device = _read_inputs(source, run, check_map)
     surfaces = plan_surfaces(settings.levels, below=settings.below is not None)
@@ -85,7 +94,7 @@ def make_parts(source: str | Path, run: Run, check_map: Callable[[LabelMap], Non
             solid, surfaces, labels, settings.labels, device, settings, run.progress
         )
     else:
-        extracted = extract_surfaces(solid, surfaces, device, settings, run.progress, labels)
+        extracted = (extract or extract_surfaces)(solid, surfaces, device, settings, run.progress, labels)
     origins = [mesh.report for mesh in extracted]
     make_solid = _remember_filled(volume, solid)
     del solid

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from clrecon.errors import UsageError
+from clrecon.exchange.formats import IN_PIECES, list_extensions
 from clrecon.jobs import options
 from clrecon.jobs.cluster import LOCAL
 from clrecon.jobs.mesh.seeds import LABEL_SEED, check_growing, check_point, is_label_seed, parse_seed
@@ -101,6 +102,12 @@ def name_level(level: float | Sequence[float]) -> str:
     """Write an iso value or a range as text: ``200``, ``100:300``."""
     return ":".join(f"{value:g}" for value in level) if isinstance(level, Sequence) else f"{level:g}"
 
+
+_OF_WHOLE_MESHES = (
+    *("purpose", "labels", "grow_from", "method", "surface", "keep", "keep_largest", "min_volume_ml", "seeds"),
+    *("all_parts", "split", "one_file", "smooth", "decimate", "max_deviation_mm", "strict"),
+)
+"""Settings of steps that take the mesh as a whole."""
 
 _inside_option = partial(option, group="inside")
 _method_option = partial(option, group="method")
@@ -216,6 +223,11 @@ class MeshSettings(options.InputSettings):
         f"write labels, components of --split or several iso values into one file ({OBJECT_FILES}), each as an object"
         " with its name and colour",
     )
+    by_slabs: bool = _files_option(
+        "--by-slabs",
+        f"write each surface ({list_extensions(IN_PIECES)}) slab by slab while it is made, with memory for a slab and"
+        " not for the mesh, which is not measured",
+    )
     labels: LabelChoice | None = None
     smooth: int | None = _refinement_option(
         "--smooth N",
@@ -245,7 +257,10 @@ class MeshSettings(options.InputSettings):
 
     def __post_init__(self) -> None:
         if self.is_shared_out:
-            options.refuse_changed(self, ("labels", "grow_from", "method", "vertex_rule", "surface"), self.scheduler)
+            names = ("labels", "grow_from", "method", "vertex_rule", "surface")
+            options.refuse_changed(self, names, options.describe_sharing(self.scheduler))
+        if self.by_slabs:
+            self._check_by_slabs()
         if self.iso_value is not None and self.preset is not None:
             raise UsageError("give either an iso value in HU or a preset, not both")
         self._check_masks()
@@ -287,6 +302,12 @@ class MeshSettings(options.InputSettings):
             raise UsageError("labels take what lies from one iso value on, not below it")
         if self.labels_pick and self.topology != "separated":
             raise UsageError(f"the topology {self.topology} follows HU: leave it out with labels, which pick the cells")
+
+    def _check_by_slabs(self) -> None:
+        asked = name_parameter("by_slabs", True)
+        options.refuse_changed(self, _OF_WHOLE_MESHES, f"{asked} keeps no mesh in memory, which this needs")
+        if self.is_shared_out:
+            raise UsageError(f"{asked} takes one device: {options.describe_sharing(self.scheduler)}")
 
     def _check_surface(self) -> None:
         """Refuse an unknown kind of surface, and `cortex` where HU do not place the outer surface of bone."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -10,20 +11,23 @@ from typing import Any
 import numpy as np
 
 from clrecon.anatomy.iso_choice import AutoLevel, settle_level
-from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.errors import UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.iso_rule import IsoRule, Level, check_topology, choose_iso_rule
+from clrecon.geometry.iso_rule import IsoRule, Level, check_topology
 from clrecon.mesh import Mesh
+from clrecon.mesh.written_parts import PartsFile
 from clrecon.opencl import Device
 from clrecon.operators.masks.enclosed import fill_enclosed
 from clrecon.operators.resident.device_volume import DeviceVolume, VolumeWorker
 from clrecon.operators.surface import marching_cubes
-from clrecon.operators.surface.extraction import Extraction
+from clrecon.operators.surface.extraction import Extraction, choose_grid
 from clrecon.operators.surface.seeds import Seeds
 from clrecon.operators.surface.slabs import SampleGrid, Slab, plan_slabs
-from clrecon.operators.surface.trilinear import check_row
+from clrecon.operators.surface.spans import PassingSurface
 from clrecon.points import PointCloud
-from clrecon.system.arguments import Topology, VertexRule, explains_arguments, name_parameter
+from clrecon.system.arguments import Space, Topology, VertexRule, explains_arguments, name_parameter
+from clrecon.system.files import check_writable
+from clrecon.system.paths import keep_existing
 from clrecon.system.progress import Progress, ignore_progress
 
 
@@ -118,6 +122,60 @@ class SurfaceExtractor(VolumeWorker):
         return mesh
 
     @explains_arguments
+    def save(
+        self,
+        path: str | os.PathLike[str],
+        iso_value: AutoLevel,
+        space: Space = "lps",
+        *,
+        closed: bool = True,
+        topology: Topology = "separated",
+        below: bool = False,
+        vertex_rule: VertexRule = "linear",
+        no_clobber: bool = False,
+        keep_ids: bool = False,
+        progress: Progress | None = None,
+    ) -> dict[str, Any]:
+        """Write the surface slab by slab while it is made: the file of ``extract(...).save(path)``, byte for byte.
+
+        A slab is in memory and not the mesh, which may be larger than memory, as may memory-mapped voxels.  They are
+        read twice, first to count the triangles, so that a disk without room for them is refused before it is written.
+
+        Parameters
+        ----------
+        path : path
+            ``.stl`` or ``.ply``: complete, or absent.
+        iso_value, closed, topology, below, vertex_rule
+            See `extract_isosurface`.
+        space, no_clobber, keep_ids
+            See ``Mesh.save``.
+
+        Returns
+        -------
+        dict
+            ``bytes``, ``vertices``, ``triangles``, and the entries of ``Mesh.report``.
+
+        Raises
+        ------
+        UsageError
+            Another format, or a volume that reaches 4096 mm from the origin.
+        OutputError
+            The file cannot be written; an older one stays.
+        """
+        progress, file = progress or ignore_progress, PartsFile(path, space, keep_ids=keep_ids)
+        with keep_existing(keep=no_clobber):
+            check_writable(path)
+            level, chosen = settle_level(self.volume, iso_value, progress)
+            passing = PassingSurface(
+                self._resident, level, closed=closed, topology=topology, below=below, vertex_rule=vertex_rule,
+                progress=progress,
+            )  # fmt: skip
+            counts = passing.vertices, passing.triangles
+            with file.stage(passing.parts(progress), counts, passing.describe() | chosen) as staged:
+                staged.commit()
+        return {"bytes": staged.size, "vertices": counts[0], "triangles": counts[1], **passing.describe(), **chosen}
+
+    @explains_arguments
     def extract_vertices(
         self, iso_value: AutoLevel, *, closed: bool = True, below: bool = False, progress: Progress | None = None
     ) -> PointCloud:
@@ -140,33 +198,6 @@ class SurfaceExtractor(VolumeWorker):
                 hu = None if level is None else np.full(len(positions), level, np.float32)
                 cloud = PointCloud.of_known(run.placement.to_lps(positions), normals, hu, report=report)
         return cloud
-
-
-def choose_grid(
-    resident: DeviceVolume,
-    iso_value: Level,
-    *,
-    closed: bool,
-    topology: str = "separated",
-    below: bool,
-    vertex_rule: str = "linear",
-) -> SampleGrid:
-    volume = resident.volume
-    rule = choose_iso_rule(
-        volume,
-        iso_value,
-        closed=closed,
-        topology=topology,
-        below=below,
-        vertex_rule=vertex_rule,
-        values=resident.values,
-    )
-    grid = SampleGrid(volume, rule)
-    if topology == "trilinear":
-        check_row(volume)
-    if min(grid.shape) < 2:
-        raise NoSurfaceError(f"an open volume of {grid.shape} voxels has no cells: leave it closed")
-    return grid
 
 
 @explains_arguments

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ from numpy.typing import DTypeLike, NDArray
 from clrecon.anatomy.head import warn_of_face
 from clrecon.errors import ClreconError, DeviceError, DeviceMemoryError, NoSurfaceError
 from clrecon.geometry import Volume
-from clrecon.geometry.iso_rule import IsoRule, data_range, describe_range
+from clrecon.geometry.iso_rule import IsoRule, Level, choose_iso_rule, data_range, describe_range
 from clrecon.geometry.vertices import warnings_of_far, warnings_of_rule
 from clrecon.opencl import Device, Program, Stopwatch, result_pages
 from clrecon.operators.resident.device_volume import DeviceVolume
@@ -24,7 +24,7 @@ from clrecon.operators.surface.growing import Grown, grow, growing_needs, join_s
 from clrecon.operators.surface.marching_cubes import Classified, Counted, Placement, count
 from clrecon.operators.surface.seeds import Seeds
 from clrecon.operators.surface.slabs import BRICKS, SampleGrid, Slab, plan_slabs
-from clrecon.operators.surface.trilinear import prepare_trilinear
+from clrecon.operators.surface.trilinear import check_row, prepare_trilinear
 from clrecon.system.progress import Progress
 
 Part = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]
@@ -121,6 +121,33 @@ def keep_bricks(resident: DeviceVolume, voxels_d: Any) -> BrickRanges:
     return resident.keep(BRICKS, None, brick_bytes(shape, dtype), measure)
 
 
+def choose_grid(
+    resident: DeviceVolume,
+    iso_value: Level,
+    *,
+    closed: bool,
+    topology: str = "separated",
+    below: bool,
+    vertex_rule: str = "linear",
+) -> SampleGrid:
+    volume = resident.volume
+    rule = choose_iso_rule(
+        volume,
+        iso_value,
+        closed=closed,
+        topology=topology,
+        below=below,
+        vertex_rule=vertex_rule,
+        values=resident.values,
+    )
+    grid = SampleGrid(volume, rule)
+    if topology == "trilinear":
+        check_row(volume)
+    if min(grid.shape) < 2:
+        raise NoSurfaceError(f"an open volume of {grid.shape} voxels has no cells: leave it closed")
+    return grid
+
+
 class Extraction:
     """One extraction, slab by slab, as the device has room; with `vertices_only` without triangles.
 
@@ -159,6 +186,21 @@ class Extraction:
 
     def run(self, progress: Progress) -> Part:
         """Build the kernels, and process the grid, as many slices at a time as fit the device."""
+        self._run_slabs(self._add_slab, progress)
+        if self.vertices == 0 and not self._is_part:
+            raise self.refuse_level()
+        return self._join()
+
+    def count(self, progress: Progress) -> tuple[int, int]:
+        """Count vertices and triangles, as `run` does before it makes them."""
+        self._run_slabs(self._count_slab, progress)
+        return self.vertices, self.triangles
+
+    def refuse_level(self) -> ClreconError:
+        """Return the error for a surface that is nowhere, in words of all values of the volume."""
+        return _refuse_level(self.device, self.grid.volume, self.grid.rule)
+
+    def _run_slabs(self, take_slab: Callable[[Slab], None], progress: Progress) -> None:
         rule, volume = self.grid.rule, self.grid.volume
         gk = self.grid.shape[2]
         progress("build", 0, 1)
@@ -176,12 +218,9 @@ class Extraction:
                 if self._seeds is not None and self._grown is None and slices < gk:
                     self._grow(self._seeds, slices)
                 while self.first < self._end:
-                    self._add_slab(Slab(self.grid, self.first, min(self.first + slices, self._end)))
+                    take_slab(Slab(self.grid, self.first, min(self.first + slices, self._end)))
                     if self.slabs > 1 or self.first < gk:
                         progress("slabs", self.first, gk)
-        if self.vertices == 0 and not self._is_part:
-            raise _refuse_level(self.device, self.grid.volume, self.grid.rule)
-        return self._join()
 
     def _join(self) -> Part:
         try:
@@ -196,18 +235,26 @@ class Extraction:
 
     def take_spans(self, spans: Sequence[SpanPart]) -> Part:
         """Join the parts of all spans, in their order, in place of `run`; their indices begin anew, and rise here."""
-        for positions, normals, triangles, facts in spans:
-            self.parts.append((positions, normals, triangles + np.uint32(self.vertices)))
-            self.vertices += len(positions)
-            self.triangles += len(triangles)
-            if max(self.vertices, self.triangles) >= 2**32:
-                raise marching_cubes.too_many(self.vertices, self.triangles)
-            self._take_facts(facts)
+        self.parts += map(self.take_span, spans)
         if self.vertices == 0:
-            raise _refuse_level(self.device, self.grid.volume, self.grid.rule)
+            raise self.refuse_level()
         return self._join()
 
-    def _take_facts(self, facts: SpanFacts) -> None:
+    def take_span(self, span: SpanPart) -> Part:
+        """Number the vertices of the next span after those of all before; return its part, which is not kept."""
+        positions, normals, triangles, facts = span
+        part = positions, normals, triangles + np.uint32(self.vertices)
+        self._number(len(positions), len(triangles))
+        self.take_facts(facts)
+        return part
+
+    def _number(self, vertices: int, triangles: int) -> None:
+        self.vertices, self.triangles = self.vertices + vertices, self.triangles + triangles
+        if max(self.vertices, self.triangles) >= 2**32:
+            raise marching_cubes.too_many(self.vertices, self.triangles)
+
+    def take_facts(self, facts: SpanFacts) -> None:
+        """Add how a span was made to the report of the whole."""
         self.slabs += facts.slabs
         self._made_on[facts.label, facts.driver] = None
         for kind, size in facts.device_bytes.items():
@@ -237,12 +284,31 @@ class Extraction:
 
     def _add_slab(self, slab: Slab) -> None:
         """Make the part of the surface that belongs to a slab."""
-        device, stopwatch = self.device, self.stopwatch
-        volume, inside = self.grid.volume, self.grid.rule.inside
+        device, volume = self.device, self.grid.volume
         program = prepare_isosurface(
-            device, volume.voxels.dtype, uneven=volume.uneven, inside=inside, vertex_rule=self.grid.rule.vertex_rule,
-            grown=self._seeds is not None,
+            device, volume.voxels.dtype, uneven=volume.uneven, inside=self.grid.rule.inside,
+            vertex_rule=self.grid.rule.vertex_rule, grown=self._seeds is not None,
         )  # fmt: skip
+        counted, voxels_d = self._find_part(slab)
+        self._check_output(slab, counted)
+        emission = marching_cubes.Emission(device, program, voxels_d, counted, self.placement, self.stopwatch)
+        part = emission.run(self.vertices)
+        self.parts.append(part)
+        self._end_slab(slab, len(part[0]), len(part[2]))
+
+    def _count_slab(self, slab: Slab) -> None:
+        counted, _ = self._find_part(slab)
+        self._end_slab(slab, counted.vertices, counted.triangles)
+
+    def _end_slab(self, slab: Slab, vertices: int, triangles: int) -> None:
+        self.grid.volume.release_slices(*slab.voxel_slices)
+        self._number(vertices, triangles)
+        self.slabs += 1
+        self.first = slab.end
+
+    def _find_part(self, slab: Slab) -> tuple[Counted, Any]:
+        """Find and count the part of the surface that belongs to a slab; return the slab's voxels too."""
+        device, stopwatch = self.device, self.stopwatch
         voxels_d = self.resident.whole(stopwatch) if slab.is_whole else self._upload_part(slab)
         with stopwatch.running(device):
             if self._grown is not None and slab.is_whole:
@@ -254,18 +320,7 @@ class Extraction:
                     self._grown = grow(self.resident, self.grid, classified, self._seeds)
                 classified = self._grown.part(classified, slab.first)
             counted = count(device, slab, classified, voxels_d)
-        if self._vertices_only:
-            counted = replace(counted, triangles=0)
-        self._check_output(slab, counted)
-        emission = marching_cubes.Emission(device, program, voxels_d, counted, self.placement, stopwatch)
-        part = emission.run(self.vertices)
-        self.grid.volume.release_slices(*slab.voxel_slices)
-        self.parts.append(part)
-        self.vertices, self.triangles = self.vertices + len(part[0]), self.triangles + len(part[2])
-        if max(self.vertices, self.triangles) >= 2**32:
-            raise marching_cubes.too_many(self.vertices, self.triangles)
-        self.slabs += 1
-        self.first = slab.end
+        return replace(counted, triangles=0) if self._vertices_only else counted, voxels_d
 
     def _upload_part(self, slab: Slab) -> Any:
         return self.resident.part(*slab.voxel_slices, self.stopwatch)

@@ -16,14 +16,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.errors import DeviceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule
+from clrecon.geometry.vertices import warnings_of_far
 from clrecon.mesh import Mesh
 from clrecon.opencl import Device
 from clrecon.operators.resident.device_volume import DeviceVolume
-from clrecon.operators.surface.extract import choose_grid
-from clrecon.operators.surface.extraction import Extraction, SpanPart
+from clrecon.operators.surface.extraction import Extraction, Part, SpanPart, choose_grid
+from clrecon.operators.surface.marching_cubes import too_many
 from clrecon.operators.surface.slabs import SampleGrid, Slab
+from clrecon.system.pieces import find_bounds
 from clrecon.system.progress import Progress, ignore_progress
 
 Span = tuple[int, int]
@@ -66,9 +69,90 @@ def extract_by_spans(
     return Mesh(run.placement.to_lps(positions), triangles, normals, report, trusted=True)
 
 
-def make_span(resident: DeviceVolume, grid: SampleGrid, span: Span) -> SpanPart:
+_VOXEL_BYTES, _MESH_BYTES = 2**25, 2**26
+"""Most bytes of a span of a surface that is not kept, and at most this share of the memory on the device:"""
+_MEMORY_SHARE = 8
+
+
+class PassingSurface:
+    """A surface that is made a span at a time and never whole: counted first, so that its size is known.
+
+    level, how: As for `extract_by_spans`.  The volume is read twice.
+    vertices, triangles: Their numbers in all spans.
+    bounds: (2, 3). Lowest and highest corner of what was made so far, LPS mm.
+    """
+
+    def __init__(self, resident: DeviceVolume, level: Any, *, progress: Progress = ignore_progress, **how: Any):
+        self._resident, self._grid = resident, choose_grid(resident, level, **how)
+        self._run = Extraction(resident, self._grid, [])
+        if self._run.placement.origin is not None:
+            raise UsageError(
+                f"{warnings_of_far(resident.volume)[0]}, or float32 where the mesh itself lies near: it is made whole"
+            )
+        (gi, gj, slices), itemsize = self._grid.shape, resident.volume.voxels.dtype.itemsize
+        share = resident.limits.total_bytes // _MEMORY_SHARE
+        length = max(_FEWEST_SLICES, min(share, _VOXEL_BYTES) // (gi * gj * itemsize))
+        self._spans: list[Span] = []
+        self.vertices = self.triangles = 0
+        self.bounds = np.array([[np.inf] * 3, [-np.inf] * 3])
+        for first in range(0, slices, length):
+            span = first, min(first + length, slices)
+            vertices, triangles = self._count(span)
+            self.vertices, self.triangles = self.vertices + vertices, self.triangles + triangles
+            self._spans += _cut_span(span, -(-(24 * vertices + 12 * triangles) // min(share, _MESH_BYTES)))
+            progress("count", span[1], slices)
+        if max(self.vertices, self.triangles) >= 2**32:
+            raise too_many(self.vertices, self.triangles)
+        if self.vertices == 0:
+            raise self._run.refuse_level()
+
+    def _count(self, span: Span) -> tuple[int, int]:
+        for attempt in self._resident.with_fallback():
+            with attempt as (_, warnings):
+                run = Extraction(self._resident, self._grid, warnings, span=span)
+                counts = run.count(ignore_progress)
+                self._run.take_facts(run.facts()._replace(slabs=0))
+        return counts
+
+    def parts(self, progress: Progress = ignore_progress) -> Iterator[Part]:
+        """Yield positions, normals and triangles of each span, whose indices are those of the whole; once."""
+        progress("slabs", 0, self._grid.shape[2])
+        for span in self._spans:
+            for attempt in self._resident.with_fallback():
+                with attempt as (_, warnings):
+                    span_part = make_span(self._resident, self._grid, span, warnings)
+            part = self._run.take_span(span_part)
+            del span_part
+            self._widen(part[0])
+            yield part
+            del part
+            progress("slabs", span[1], self._grid.shape[2])
+        if (self._run.vertices, self._run.triangles) != (self.vertices, self.triangles):
+            raise DeviceError(
+                f"{self._resident.device.label} counted {self.vertices:,} vertices and {self.triangles:,} triangles and"
+                f" made {self._run.vertices:,} and {self._run.triangles:,}: it computes wrongly, see `clrecon selftest`"
+            )
+
+    def _widen(self, positions: NDArray[np.float32]) -> None:
+        if len(positions):
+            low, high = find_bounds(positions)
+            self.bounds = np.array([np.minimum(low, self.bounds[0]), np.maximum(high, self.bounds[1])])
+
+    def describe(self) -> dict[str, Any]:
+        """Return the report of a mesh: how it was made so far."""
+        return self._run.describe(self.vertices, self.triangles)
+
+
+def _cut_span(span: Span, count: int) -> list[Span]:
+    """Cut a span into `count` parts of about as many slices, at most one a slice."""
+    first, end = span
+    length = -(-(end - first) // max(count, 1))
+    return [(start, min(start + length, end)) for start in range(first, end, length)]
+
+
+def make_span(resident: DeviceVolume, grid: SampleGrid, span: Span, warnings: list[str] | None = None) -> SpanPart:
     """Make the part of a surface that belongs to a span; the slices of its voxels alone are read."""
-    run = Extraction(resident, grid, [], span=span)
+    run = Extraction(resident, grid, [] if warnings is None else warnings, span=span)
     positions, normals, triangles = run.run(ignore_progress)
     return positions, normals, triangles, run.facts()
 
