@@ -1,7 +1,8 @@
 /* Vectors of LANES floats or ints, under names that do not depend on LANES.
  *
  * CPU drivers do not reliably make vector code of work-items that branch, so hot loops are written for LANES values at
- * once; on a GPU, where a work-item is a lane already, LANES is 1.  The host chooses (-D LANES=8). */
+ * once; on a GPU, where a work-item is a lane already, LANES is 1.  The host chooses (-D LANES=8).  Files that define
+ * TAKES_WIDE_LANES first have 16 instead where the processor has AVX-512 and the driver HAS_WIDE_LANES. */
 #ifndef CLRECON_LANES_H
 #define CLRECON_LANES_H
 
@@ -9,7 +10,21 @@
 #define LANES 1
 #endif
 
-#if LANES == 8
+#if LANES == 8 && defined(TAKES_WIDE_LANES) && HAS_WIDE_LANES && defined(__AVX512F__)
+#undef LANES
+#define LANES 16
+#endif
+
+#if LANES == 16
+typedef float16 floats;
+typedef int16 ints;
+#define to_floats convert_float16
+#define to_ints convert_int16
+#define as_floats as_float16
+#define as_ints as_int16
+#define load_lanes(pointer) vload16(0, pointer)
+#define store_lanes(vector, pointer) vstore16(vector, 0, pointer)
+#elif LANES == 8
 typedef float8 floats;
 typedef int8 ints;
 #define to_floats convert_float8

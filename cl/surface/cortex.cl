@@ -17,6 +17,7 @@
  *                        with CUBIC values between slices are those of a cubic convolution of four of them, where their
  *                        gaps are alike within 1 %, else linear
  *   2. fit_profiles      all places of a piece; HU count in thousands inside, so that float32 keeps its digits */
+#define TAKES_WIDE_LANES
 #include "include/lanes.h"
 #include "include/volume.h"
 

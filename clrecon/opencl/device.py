@@ -238,7 +238,9 @@ class Device:
         self.keeps_binaries: bool = not quirks.keeps_programs(self.platform)
         self.known_good: KnownGood | None = known_good() if quirks.is_pocl(self.platform) else None
         self._remarks: list[str] = []
-        self.kernel_variants: dict[str, str] = quirks.kernel_variants(self.platform, self.type)
+        self.kernel_variants: dict[str, str] = quirks.kernel_variants(
+            self.platform, self.type, _version_numbers(self.driver)
+        )
         self.first_header: str = quirks.first_header(self.platform, _version_numbers(self.driver))
         self.shortcoming: str = _find_shortcoming(cl_device)
         language = quirks.language_option(self.platform, self.type, _version_numbers(self.driver))

@@ -135,16 +135,18 @@ def most_steps(device_name: str) -> int | None:
     return 65535 if is_software_gpu(device_name) else None
 
 
-def kernel_variants(platform_name: str, device_type: str) -> dict[str, str]:
+def kernel_variants(platform_name: str, device_type: str, driver: tuple[int, ...] = ()) -> dict[str, str]:
     """Return definitions for kernels with special code for CPUs, whose compilers do not turn work-items into vectors.
 
     LANES is the length of their vectors: 8 is one AVX register; half an AVX-512 register or two NEON registers cost
-    little.  WORDS_PER_ITEM is the number of neighbouring words of a mask for each work-item, so that its vectors are
-    full.  OpenCL's prefetch() has no effect in PoCL; the builtin of its compiler, clang, has.
+    little.  Kernel files that ask for it take whole ones where HAS_WIDE_LANES is 1: PoCL 3.0 computes them wrong.
+    WORDS_PER_ITEM is the number of neighbouring words of a mask for each work-item, so that its vectors are full.
+    OpenCL's prefetch() has no effect in PoCL; the builtin of its compiler, clang, has.
     """
     if device_type != "cpu" or is_simulator(platform_name):
         return {"LANES": "1", "WORDS_PER_ITEM": "1"}
     variants = {"LANES": "8", "WORDS_PER_ITEM": "8"}
     if is_pocl(platform_name):
         variants["HAS_BUILTIN_PREFETCH"] = "1"
+        variants["HAS_WIDE_LANES"] = str(int(driver >= (3, 1)))
     return variants

@@ -281,8 +281,8 @@ class WallProfiles:
 
 
 def stride_of(count: int) -> int:
-    """Return the places of a row on the device: whole vectors of eight."""
-    return 8 * -(-count // 8)
+    """Return the places of a row on the device: whole vectors of sixteen."""
+    return 16 * -(-count // 16)
 
 
 def expected_precisions(cortex_hu: float, noise_hu: float, cortex_spread: float) -> tuple[float, float, float]:
@@ -294,8 +294,10 @@ def expected_precisions(cortex_hu: float, noise_hu: float, cortex_spread: float)
 
 
 def prepare_profiles(device: Device, dtype: DTypeLike = np.int16, *, cubic: bool = False) -> Program:
-    variants = {**voxel_variants(dtype), "LANES": device.kernel_variants["LANES"], **({"CUBIC": "1"} if cubic else {})}
-    return load_program(device, "surface/cortex.cl", variants)
+    lanes = {name: value for name, value in device.kernel_variants.items() if "LANES" in name}
+    return load_program(
+        device, "surface/cortex.cl", {**voxel_variants(dtype), **lanes, **({"CUBIC": "1"} if cubic else {})}
+    )
 
 
 class ProfileSampler:
