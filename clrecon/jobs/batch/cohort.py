@@ -22,7 +22,7 @@ from clrecon.jobs.batch.plan import PAGE, REPORT, TABLE, Case, Plan
 from clrecon.system.files import replace_file
 from clrecon.version import package_version
 
-_MISSING = "missing"
+MISSING = "missing"
 """Status of a case that nobody has made."""
 
 _ALL_LABELS = "cohort_labels.csv"
@@ -40,13 +40,23 @@ _FAR, _FEWEST = 3.5, 8
 absolute deviation; Iglewicz and Hoaglin 1993), among so many cases at least."""
 
 
-def write_cohort(cases: Sequence[Case], plan: Plan) -> Counter[str]:
-    """Write the tables and the page from the reports that are there; return how many cases have each status."""
+_NAMED = 20
+"""Missing cases that are named; the table has all."""
+
+
+def write_cohort(cases: Sequence[Case], plan: Plan) -> tuple[Counter[str], list[str]]:
+    """Write the tables and the page from the reports that are there.
+
+    Returns: How many cases have each status, and the names of the first that are missing.
+    """
     root = Path(plan.output)
     figures: dict[str, list[float]] = {column: [] for column in _JUDGED}
     counts: Counter[str] = Counter()
+    missing: list[str] = []
     for row in _find_rows(cases, plan):
         counts[row["status"]] += 1
+        if row["status"] == MISSING and len(missing) < _NAMED:
+            missing.append(row["case"])
         for column, values in figures.items():
             if isinstance(row[column], int | float):
                 values.append(row[column])
@@ -55,14 +65,14 @@ def write_cohort(cases: Sequence[Case], plan: Plan) -> Counter[str]:
     replace_file(root / PAGE, lambda stream: _write_page(stream, root, counts))
     if any(case.labels is not None for case in cases):
         replace_file(root / _ALL_LABELS, lambda stream: _join_labels(stream, cases, plan))
-    return counts
+    return counts, missing
 
 
 def _find_rows(cases: Iterable[Case], plan: Plan) -> Iterator[dict[str, Any]]:
     for case in cases:
         report = read_report(plan.folder_of(case))
         if report is None:
-            yield dict.fromkeys(_COLUMNS) | {"case": case.name, "status": _MISSING}
+            yield dict.fromkeys(_COLUMNS) | {"case": case.name, "status": MISSING}
         else:
             yield _make_row(report)
 
@@ -170,7 +180,7 @@ def _lay_out_row(row: Mapping[str, str], root: Path) -> str:
     folder, far = root / row["case"], row["outliers"].split()
     pictures = sorted(folder.glob(PICTURE.replace(".", "*.")))
     picture = "".join(f'<img src="{case}/{escape(path.name)}" alt="" loading="lazy">' for path in pictures)
-    name = f'<a href="{case}/{REPORT}">{case}</a>' if row["status"] != _MISSING else case
+    name = f'<a href="{case}/{REPORT}">{case}</a>' if row["status"] != MISSING else case
     reason = f"<small>{escape(row['error'])}</small>" if row["error"] else ""
     kind = "" if row["status"] == DONE else ' class="bad"'
     gates = escape(row["gates_failed"]) or "kept" * (row["status"] in (DONE, GATE))

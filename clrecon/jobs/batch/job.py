@@ -10,7 +10,7 @@ from time import perf_counter
 
 from clrecon.errors import PARTLY_DONE, OutputError, UnreachableError, UsageError
 from clrecon.jobs.batch.case import DONE, LOST, fail_case, read_report
-from clrecon.jobs.batch.cohort import write_cohort
+from clrecon.jobs.batch.cohort import MISSING, write_cohort
 from clrecon.jobs.batch.plan import PAGE, TABLE, Case, Plan, check_places
 from clrecon.jobs.batch.scheduler import DaskScheduler, LocalScheduler, Outcome, Scheduler
 from clrecon.jobs.mesh.settings import MeshSettings
@@ -68,7 +68,7 @@ def run_batch(
             check_files([("the table", root / TABLE), ("the page", root / PAGE)])
         waiting = [] if asked.collect else chosen
         if asked.retry:
-            waiting = [case for case in chosen if _has_failed(case, plan)]
+            waiting = [case for case in chosen if _find_status(case, plan) in asked.retry]
             kept_count = len(chosen) - len(waiting)
         start = perf_counter()
         progress(_count_cases(0, len(waiting), None), 0, 0)
@@ -88,7 +88,9 @@ def run_batch(
             progress(_count_cases(number, len(waiting), seconds if made_count else None), 0, 0)
         run.lap("cases")
         if asked.part is None:
-            counts = write_cohort(cases, plan)
+            counts, names = write_cohort(cases, plan)
+            if names:
+                warn(f"{counts[MISSING]:,} of {len(cases):,} cases are missing: {_list_names(names, counts[MISSING])}")
             run.lap("table")
         statuses = dict(counts.most_common())
         return run.report(BatchReport, (), cases=len(chosen), made=made_count, kept=kept_count, statuses=statuses)
@@ -152,9 +154,15 @@ def _open_output(plan: Plan, cases: Sequence[Case]) -> Path:
     return root
 
 
-def _has_failed(case: Case, plan: Plan) -> bool:
+def _find_status(case: Case, plan: Plan) -> str:
     report = read_report(plan.folder_of(case))
-    return report is not None and report["status"] != DONE
+    return MISSING if report is None else str(report["status"])
+
+
+def _list_names(names: Sequence[str], count: int) -> str:
+    """List the first names of cases that have not run, and say how all of them are run."""
+    more = f" and {count - len(names):,} more, all in {TABLE}" if count > len(names) else ""
+    return f"{', '.join(names)}{more}; {name_parameter('retry', MISSING)} runs them"
 
 
 def _count_cases(number: int, total: int, seconds: float | None) -> str:

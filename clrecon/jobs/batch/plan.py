@@ -39,6 +39,18 @@ def _parse_part(text: str) -> tuple[int, int]:
     return int(number), int(count)
 
 
+_STATUSES = ("gate", "refused", "failed", "lost", "missing")
+"""What can be said of a case that is not done, see docs/batch.md."""
+
+
+def _parse_statuses(text: str) -> tuple[str, ...]:
+    statuses = tuple(part.strip().lower() for part in text.split(","))
+    for status in statuses:
+        if status not in _STATUSES:
+            raise ValueError(unknown_name("status", status, _STATUSES))
+    return statuses
+
+
 def _parse_extension(text: str) -> str:
     return text.lower() if text.startswith(".") else f".{text.lower()}"
 
@@ -117,7 +129,18 @@ class BatchSettings:
         "--resume", "skip cases that exist already, made from the same files with the same settings", group="again",
         first=True,
     )  # fmt: skip
-    retry: bool = option("--retry", "repeat only the cases that are not done", group="again", first=True)
+    retry: Sequence[str] = option(
+        "--retry STATUS[,STATUS]",
+        f"run only cases with one of these statuses: {', '.join(_STATUSES)} (without a status: all of them but"
+        f" {_STATUSES[-1]})",
+        group="again",
+        first=True,
+        default=(),
+        nargs="?",
+        const=_STATUSES[:-1],
+        parse=_parse_statuses,
+        words=_STATUSES,
+    )
     collect: bool = option(
         "--collect", "make no case: write the table and the page of the existing cases", group="again", first=True
     )

@@ -204,6 +204,26 @@ def test_retry_makes_refused_cases_again_and_leaves_done_ones_as_they_are(whole_
     assert files_of(folder / "out" / "A") == before
 
 
+@pytest.mark.seconds
+@pytest.mark.parametrize(("status", "made"), [("refused", 1), ("missing", 1), ("missing,refused", 2), ("failed", 0)])
+def test_retry_of_a_status_makes_the_cases_that_have_it(
+    whole_batch: Batch, printed: Any, status: str, made: int
+) -> None:
+    """Three are done, `gone` is refused, `later` has never run."""
+    with (whole_batch.folder / "m.csv").open("a") as table:
+        table.write("later,ball1\n")
+    printed()
+    assert whole_batch.run("--retry", status, "--json") == PARTLY_DONE
+    assert printed().report()["made"] == made
+
+
+def test_collect_names_cases_that_were_not_made(whole_batch: Batch, printed: Any) -> None:
+    (whole_batch.folder / "m.csv").write_text("case,input\nA,ball1\nlater,ball2\nnever,ball3\n")
+    printed()
+    assert whole_batch.run("--collect") == PARTLY_DONE
+    printed().assert_error(2, 3, "later", "never")  # 2 of 3 cases
+
+
 def test_collect_lists_a_case_that_was_not_made_as_missing_and_makes_none(whole_batch: Batch, printed: Any) -> None:
     output = whole_batch.folder / "out"
     (whole_batch.folder / "m.csv").write_text("case,input\nA,ball1\nlater,ball2\n")

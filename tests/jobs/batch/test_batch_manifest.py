@@ -148,6 +148,7 @@ WRONG_OPTIONS = {
     "no worker": (["--workers", "0"], 3, "0"),
     "format unknown": (["--format", "xyz"], 3, ".stl"),
     "two ways with earlier cases": (["--resume", "--retry"], 3, "--retry"),
+    "status unknown": (["--retry", "refuse"], 3, "refused"),
     "collect a part": (["--collect", "--part", "1/2"], 3, "--part"),
     "devices and a device": (["--devices", "0,1", "--device", "cpu"], 3, "--device"),
     "devices by name": (["--devices", "cpu"], 3, "cpu"),
