@@ -17,6 +17,7 @@ from clrecon.errors import ClreconError, OutputError, UsageError
 from clrecon.jobs.options import DeviceSettings, InputSettings, ScanSettings
 from clrecon.system.arguments import OptionSpeaker
 from clrecon.system.options import option_beside, options_of
+from clrecon.system.packages import missing_package
 from clrecon.system.processes import has_hung_device
 from clrecon.system.progress import DEFAULT_SECONDS, check_time_limit
 from clrecon.system.text import guess_word
@@ -410,6 +411,8 @@ def _report_error(error: BaseException, console: Console, debug: bool) -> int:
         known = error
     elif isinstance(error, MemoryError):
         known = ClreconError("out of memory: free some, or use a smaller series")
+    elif isinstance(error, ModuleNotFoundError) and error.name and not error.name.startswith("clrecon"):
+        known = missing_package(error.name, "this")
     else:
         hint = "" if debug else "; run again with --debug for details, and please report it"
         known = ClreconError(f"unexpected error ({type(error).__name__}: {str(error)[:300]}){hint}")

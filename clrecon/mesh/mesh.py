@@ -354,6 +354,25 @@ class Mesh(BaseMesh, ShownAsHtml):
         converted.units = "mm"
         return converted
 
+    def to_meshio(self) -> Any:
+        """Return the mesh as ``meshio.Mesh`` in LPS mm, for the formats that meshio writes, such as Abaqus and VTU.
+
+        ``normals`` and ``values`` are its ``point_data``, ``face_values`` its ``cell_data``.
+
+        Raises
+        ------
+        UsageError
+            meshio is not installed, or the mesh fails ``check``.
+        """
+        meshio = import_package("meshio", "to_meshio")
+        self.check()
+        return meshio.Mesh(
+            np.array(self.vertices),
+            [("triangle", self.triangles.astype(np.int64))],
+            point_data=({} if self.normals is None else {"Normals": self.normals}) | self.checked_values(),
+            cell_data={name: [numbers] for name, numbers in self.checked_face_values().items()},
+        )
+
     @classmethod
     @explains_arguments
     def from_trimesh(cls, mesh: Any, space: Space | None = None) -> Mesh:

@@ -39,7 +39,7 @@ class Bucket:
     def __init__(self, parts: SplitResult):
         self._name = shown_url(parts.geturl())
         self._obstore = import_package("obstore", f"a URL {parts.scheme}://")
-        import_package("obstore.store", "a bucket", "obstore")
+        import_package("obstore.store", "a bucket")
         folder, slash, key = parts.path.rpartition("/")
         self._key = unquote(key)
         self._is_ending = False

@@ -31,14 +31,29 @@ def show_unused() -> None:
             del sys.modules[name]
 
 
-def import_package(module: str, subject: str, package: str | None = None) -> Any:
-    """Import a module; `subject` needs it, for the message, and `package` is its name when it is installed."""
+_INSTALLED_AS = {"nrrd": "pynrrd", "skimage": "scikit-image", "vtkmodules": "vtk"}
+"""Packages by their modules, where the names differ."""
+
+
+def package_of(module: str) -> str:
+    """Return the name by which the package of a module is installed."""
+    top = module.partition(".")[0]
+    return _INSTALLED_AS.get(top, top)
+
+
+def import_package(module: str, subject: str) -> Any:
+    """Import a module that `subject` needs; without its package the message says how to install that."""
     show_unused()
     try:
         return import_module(module)
     except ImportError as error:
-        named = package or module
-        raise UsageError(f"{subject} needs the package {named}: {install_command(named)}") from error
+        raise missing_package(module, subject) from error
+
+
+def missing_package(module: str, subject: str) -> UsageError:
+    """Return the error of what needs a module that is not installed."""
+    package = package_of(module)
+    return UsageError(f"{subject} needs the package {package}: {install_command(package)}")
 
 
 def install_command(*packages: str) -> str:

@@ -18,8 +18,8 @@ _OPENING = """# Both papers reproduced
 
 clrecon implements the methods of two papers on the reconstruction of vertebrae:
 
-- **Paper A** is "CPU-GPU Rendering of CT Scan Images for Vertebra Reconstruction from CT Scan Images with a Calibration
-  Policy".
+- **Paper A** is Khan et al., "CPU-GPU Rendering of CT Scan Images for Vertebra Reconstruction from CT Scan Images with
+  a Calibration Policy", Medical Imaging and Radiation Sciences, 2020, DOI 10.31487/j.MIRS.2020.01.02.
 - **Paper B** is Liu et al., "Vertebrae CT Images 3D Reconstruction with Improve Marching Cubes Algorithm", J. Harbin
   Inst. Technol. (New Series) 26(6): 69-79, 2019, DOI 10.11916/j.issn.1005-9113.18042.
 

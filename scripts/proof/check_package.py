@@ -1,12 +1,14 @@
 #!/usr/bin/env python3
-"""Build the source distribution and the wheel, and use the wheel in an environment of its own.
+"""Build the source distribution and the wheel, use the wheel in environments of its own, and test from the sources.
 
-    python scripts/proof/check_package.py [FOLDER]
+    python scripts/proof/check_package.py [FOLDER] [--tests PATH ...]
 
 Needs `build` and `twine` of the extra release, and the package index.  A copy of the project is built as a stranger
 would build it: the wheel comes from the source distribution.  That must hold every file of the project; the wheel must
 run on every Python 3 and system; twine must find nothing in the metadata; and the installed command must write a
-phantom and its mesh.  Both files go to FOLDER (default: dist).  The exit status is 1 if something is missing.
+phantom and its mesh.  The small installation of docs/install.md must stay below its size and run its commands; it needs
+an OpenCL driver of the system.  Tests must pass from the unpacked source distribution: those of PATH, by default guards
+and quick ones.  Both files go to FOLDER (default: dist).  The exit status is 1 if something is missing.
 """
 
 from __future__ import annotations
@@ -24,8 +26,28 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
+SMALL = ROOT / "scripts" / "package" / "small.txt"
+SMALL_MB = 250
 PURE = "-py3-none-any.whl"
 """The end of the name of a wheel without compiled code."""
+COMMANDS = ("phantom scan --levels L2-L4 --size 96 --spacing 1.8 1.8 1.8", "mesh scan -o bone.stl")
+SMALL_COMMANDS = (
+    *COMMANDS,
+    "info scan --pixels",
+    "mesh scan -o cortex.vtp --surface cortex --smooth --decimate 0.5",
+    "mesh scan -o print.3mf --for print",
+    "mesh scan -o l3.stl --labels scan/levels.nrrd --label L3",
+    "render scan -o bone.png --preset bone --letters --scale-bar",
+    "cloud scan -o bone.npz --hu 200,3000 --cluster eps=2,min=6",
+    "stats scan --labels scan/levels.nrrd --csv spine.csv",
+    "distance bone.stl cortex.vtp --picture distance.png",
+    "inside scan --labels scan/levels.nrrd --label L3 -o inside.ply",
+    "corridor scan --labels scan/levels.nrrd --label L3",
+    "export scan -o scan.nii.gz",
+    "view scan --html page.html",
+)
+"""What an installation without VTK, pyvista and matplotlib runs."""
+TESTS = ("tests/guards", "tests/geometry", "tests/exchange")
 
 
 def listed_files() -> list[str]:
@@ -54,27 +76,50 @@ def build(folder: Path) -> tuple[Path, Path]:
     return newest[0], newest[1]
 
 
-def use(wheel: Path, folder: Path) -> int:
-    """Install `wheel` into an environment in `folder`, make a mesh there, and return its size in bytes."""
-    venv.create(folder / "environment", with_pip=True)
+def size_mb(folder: Path) -> float:
+    """Return the size of the files in a folder, in MB of 10^6 bytes."""
+    return sum(path.lstat().st_size for path in folder.rglob("*") if not path.is_dir()) / 1e6
+
+
+def use(installations: Iterable[Sequence[str]], commands: Iterable[str], folder: Path) -> tuple[float, float]:
+    """Install by arguments of ``pip install`` into an environment in `folder`, and run commands of clrecon there.
+
+    Returns its size in MB, without pip, before and after the commands: Python keeps modules that it has compiled.
+    """
+    venv.create(folder / "environment", with_pip=False)
     programs = folder / "environment" / ("Scripts" if os.name == "nt" else "bin")
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    for program, *arguments in (
-        ["python", "-m", "pip", "install", "-q", str(wheel)],
-        ["clrecon", "phantom", "scan"],
-        ["clrecon", "mesh", "scan", "-o", "bone.stl"],
-    ):
-        subprocess.run([str(programs / program), *arguments], cwd=folder, env=environment, check=True)
-    return (folder / "bone.stl").stat().st_size
+
+    def run(*command: str | Path) -> None:
+        subprocess.run(command, cwd=folder, env=environment, check=True, stdout=2)
+
+    for arguments in installations:
+        run(sys.executable, "-m", "pip", "--python", programs / "python", "install", "-q", *arguments)
+    before = size_mb(folder / "environment")
+    for command in commands:
+        run(programs / "clrecon", *command.split(), "-q")
+    return before, size_mb(folder / "environment")
+
+
+def pass_tests(archive: Path, paths: Sequence[str]) -> bool:
+    """Tell whether tests pass from an unpacked source distribution, with the packages of this environment."""
+    with tempfile.TemporaryDirectory() as temporary:
+        with tarfile.open(archive) as opened:
+            opened.extractall(temporary)
+        (folder,) = Path(temporary).iterdir()
+        environment = {**os.environ, "PYTHONPATH": str(folder), "CLRECON_FAST_TESTS": "1"}
+        tests = [sys.executable, "-m", "pytest", "-q", "--assert=plain", "-p", "no:cacheprovider", *paths]
+        return subprocess.run(tests, cwd=folder, env=environment).returncode == 0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("folder", nargs="?", type=Path, default=ROOT / "dist")
-    folder = parser.parse_args(argv).folder
+    parser.add_argument("--tests", nargs="+", metavar="PATH", default=TESTS, help="tests to run from the sources")
+    options = parser.parse_args(argv)
     started = time.monotonic()
-    source, wheel = build(folder.resolve())
-    built = time.monotonic()
+    source, wheel = build(options.folder.resolve())
+    print(f"built in {time.monotonic() - started:.0f} s")
     for path in (source, wheel):
         print(f"{path.name}: {path.stat().st_size:,} bytes")
     faults = [f"{source.name} lacks {name}" for name in missing_files(listed_files(), source)]
@@ -82,10 +127,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         faults.append(f"{wheel.name} does not end with {PURE}")
     if subprocess.run([sys.executable, "-m", "twine", "check", "--strict", str(source), str(wheel)]).returncode:
         faults.append("twine finds faults in the metadata")
-    with tempfile.TemporaryDirectory() as temporary:
-        size = use(wheel, Path(temporary))
-    print(f"the installed command wrote a mesh of {size:,} bytes")
-    print(f"built in {built - started:.0f} s, installed and used in {time.monotonic() - built:.0f} s")
+    small = [["--no-compile", "-r", str(SMALL)], ["--no-compile", "--no-deps", str(wheel)]]
+    for name, installations, commands in (("default", [[str(wheel)]], COMMANDS), ("small", small, SMALL_COMMANDS)):
+        started = time.monotonic()
+        with tempfile.TemporaryDirectory() as temporary:
+            before, after = use(installations, commands, Path(temporary))
+        seconds = time.monotonic() - started
+        print(f"{name} installation: {before:.0f} MB, {after:.0f} MB after its commands; {seconds:.0f} s")
+        if name == "small" and before > SMALL_MB:
+            faults.append(f"the small installation has {before:.0f} MB, more than {SMALL_MB}")
+    if not pass_tests(source, options.tests):
+        faults.append("tests fail in the unpacked source distribution")
     for fault in faults:
         print(fault, file=sys.stderr)
     return 1 if faults else 0

@@ -177,6 +177,12 @@ def test_tuple_of_iso_values_is_said_to_make_several_meshes(levels: Any, words: 
         (UsageError("a"), UsageError.exit_code, "clrecon: error: a\n"),
         (MemoryError(), ClreconError.exit_code, "clrecon: error: out of memory: free some, or use a smaller series\n"),
         (ZeroDivisionError("b"), ClreconError.exit_code, "clrecon: error: unexpected error (ZeroDivisionError: b)"),
+        (
+            ModuleNotFoundError(name="scipy.sparse"),
+            UsageError.exit_code,
+            "clrecon: error: this needs the package scipy",
+        ),
+        (ModuleNotFoundError(name="clrecon.x"), ClreconError.exit_code, "clrecon: error: unexpected error (ModuleNot"),
     ],
 )
 def test_errors_are_printed_in_a_line_with_their_exit_code(

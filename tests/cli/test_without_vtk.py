@@ -1,4 +1,4 @@
-"""Commands in an installation that has neither VTK nor pyvista."""
+"""Commands in an installation that has neither VTK nor pyvista, or no scipy."""
 
 from __future__ import annotations
 
@@ -16,11 +16,16 @@ from clrecon.proof.phantom import PhantomSettings, write_phantom
 OF_VTK = ("vtk", "vtkmodules", "pyvista")
 
 
+def hide_packages(monkeypatch: pytest.MonkeyPatch, *packages: str) -> None:
+    """Let these packages be imported no more."""
+    for name in {*packages, *(name for name in sys.modules if name.split(".")[0] in packages)}:
+        monkeypatch.setitem(sys.modules, name, None)
+
+
 @pytest.fixture
 def without_vtk(monkeypatch: pytest.MonkeyPatch) -> None:
     """VTK and pyvista cannot be imported."""
-    for name in {*OF_VTK, *(name for name in sys.modules if name.split(".")[0] in OF_VTK)}:
-        monkeypatch.setitem(sys.modules, name, None)
+    hide_packages(monkeypatch, *OF_VTK)
 
 
 @pytest.fixture
@@ -52,8 +57,7 @@ def test_command_that_refines_or_writes_files_of_vtk_writes_its_file_without_it(
 def test_comparison_without_matplotlib_names_it_and_writes_nothing(
     device: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for name in {"matplotlib", *(name for name in sys.modules if name.split(".")[0] == "matplotlib")}:
-        monkeypatch.setitem(sys.modules, name, None)
+    hide_packages(monkeypatch, "matplotlib")
 
     assert main(["compare", "ct", "-o", "report", "--hu", "226", "--device", str(device.index), "-q"]) == 3
 
@@ -80,3 +84,47 @@ def test_nearest_points_and_rays_of_a_mesh_are_found_without_vtk(device: Any) ->
     middles = mesh.vertices[mesh.triangles[:3]].mean(axis=1)
     above = middles + [0.0, 0.0, 500.0]  # mm: outside of the mesh
     assert np.isfinite(mesh.ray(above, middles - above)).all()
+
+
+@pytest.fixture
+def ct_without_scipy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A CT in the folder ct of the working folder, where scipy cannot be imported."""
+    hide_packages(monkeypatch, "scipy", "skimage")
+    monkeypatch.chdir(tmp_path)
+    write_phantom(tmp_path / "ct", PhantomSettings(size=(80, 80), slices=30, spacing=(2.4, 2.4, 3.0)))
+
+
+@pytest.mark.usefixtures("ct_without_scipy")
+@pytest.mark.parametrize(
+    "command",
+    [
+        "mesh ct -o a.stl --hu auto --keep-largest 1 --remove-table",
+        "render ct -o b.png --size 64",
+        "cloud ct -o c.ply --hu 300,3000",
+        "export ct -o d.nii.gz",
+        "view ct --html e.html",
+    ],
+)
+def test_command_that_neither_fits_nor_smooths_runs_without_scipy(device: Any, command: str) -> None:
+    words = command.split()
+    named = [] if words[0] == "export" else ["--device", str(device.index)]
+    assert main([*words, *named]) == 0
+    assert Path(words[3]).stat().st_size > 1000  # bytes
+
+
+@pytest.mark.usefixtures("ct_without_scipy")
+@pytest.mark.parametrize(
+    ("command", "package"),
+    [
+        ("mesh ct -o a.stl --smooth", "scipy"),
+        ("vertebrae ct -o a.nii.gz", "scikit-image"),
+        ("mesh ct -o a.stl --method skimage", "scikit-image"),
+    ],
+)
+def test_command_names_the_package_that_it_lacks_and_writes_nothing(
+    device: Any, command: str, package: str, printed: Any
+) -> None:
+    named = [] if command.startswith("vertebrae") else ["--device", str(device.index)]
+    assert main([*command.split(), *named, "-q"]) == 3
+    printed().assert_error(package, f"install {package}")
+    assert [path.name for path in Path().iterdir()] == ["ct"]

@@ -12,10 +12,10 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 100_033,
+    "lines": 100_051,
     "modules": 437,
     "small_modules_with_one_reader": 8,
-    "docstrings_with_raises": 138,
+    "docstrings_with_raises": 139,
     "options_in_several_files": 8,
     "modules_with_own_all": 0,
 }

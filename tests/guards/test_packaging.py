@@ -131,6 +131,15 @@ def test_list_without_vtk_is_what_setup_cfg_requires_but_for_vtk_pyvista_and_mat
     assert [line for line in listed if line[0] != "#"] == expected
 
 
+def test_list_of_the_small_installation_is_that_without_vtk_but_for_its_driver_two_codecs_and_scikit_image() -> None:
+    def stated(name: str) -> list[str]:
+        return [line for line in (PACKAGES / name).read_text(encoding="utf-8").splitlines() if line[0] != "#"]
+
+    left_out = ("imagecodecs ", "pyjpegls ", "scikit-image ", "pyopencl")
+    kept = [line for line in stated("without-vtk.txt") if not line.startswith(left_out)]
+    assert [*kept, "pyopencl >= 2024.2"] == stated("small.txt")
+
+
 def test_version_of_the_conda_recipe_is_that_of_setup_cfg() -> None:
     recipe = (PACKAGES / "recipe.yaml").read_text(encoding="utf-8")
     assert f'version: "{read_setup()["metadata"]["version"]}"' in recipe

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -245,6 +246,34 @@ def test_to_trimesh_is_refused_where_the_package_is_missing(monkeypatch: pytest.
     monkeypatch.setitem(sys.modules, "trimesh", None)
     with refused(UsageError, "to_trimesh", "package"):
         three_parts().to_trimesh()
+
+
+@pytest.mark.parametrize("name", ["a.vtu", "a.inp", "a.vtk"])
+def test_files_of_meshio_have_the_vertices_and_triangles_of_a_mesh(name: str, tmp_path: Path) -> None:
+    meshio = pytest.importorskip("meshio")
+    mesh = three_parts()
+    mesh.to_meshio().write(tmp_path / name)
+    back = meshio.read(tmp_path / name)
+    np.testing.assert_allclose(back.points, mesh.vertices, rtol=1e-7)  # text of 16 digits
+    np.testing.assert_array_equal(back.cells_dict["triangle"], mesh.triangles)
+
+
+def test_meshio_gets_normals_and_values_of_vertices_and_triangles() -> None:
+    pytest.importorskip("meshio")
+    vertices, triangles = ball(1.0)
+    mesh = Mesh(vertices, triangles, normals=vertices)
+    mesh.values["HU"] = np.arange(len(vertices), dtype=np.float32)
+    mesh.face_values["wall"] = np.arange(len(triangles), dtype=np.float32)
+    other = mesh.to_meshio()
+    np.testing.assert_array_equal(other.point_data["Normals"], mesh.normals)
+    np.testing.assert_array_equal(other.point_data["HU"], mesh.values["HU"])
+    np.testing.assert_array_equal(other.cell_data_dict["wall"]["triangle"], mesh.face_values["wall"])
+
+
+def test_to_meshio_is_refused_where_the_package_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "meshio", None)
+    with refused(UsageError, "to_meshio", "package"):
+        three_parts().to_meshio()
 
 
 def box_of_trimesh(unit: str | None = None, space: str | None = None) -> Any:

@@ -309,7 +309,7 @@ def _read_table(path: str | Path) -> list[Case]:
 
 def _read_parquet(name: str, path: str | Path, folder: str) -> list[Case]:
     """Read the rows of a Parquet file, which count as the lines of a table below its line of columns."""
-    parquet = import_package("pyarrow.parquet", "a manifest in Parquet", "pyarrow")
+    parquet = import_package("pyarrow.parquet", "a manifest in Parquet")
     with open_regular(path) as stream:
         try:
             table = parquet.ParquetFile(stream)

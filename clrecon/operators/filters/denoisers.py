@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from importlib import import_module, metadata
+from importlib import metadata
 from typing import Any, TypeVar
 
 import numpy as np
@@ -20,7 +20,7 @@ from clrecon.operators.filters.settings import checked_length, report_filter
 from clrecon.operators.resident.device_volume import DeviceVolume, take_volume
 from clrecon.system.arguments import FilterName, explains_arguments
 from clrecon.system.light_dataclass import dataclass
-from clrecon.system.packages import install_command
+from clrecon.system.packages import import_package, package_of
 from clrecon.system.progress import Progress, ignore_progress
 
 VolumeKind = TypeVar("VolumeKind", Volume, DeviceVolume)
@@ -28,15 +28,8 @@ VolumeKind = TypeVar("VolumeKind", Volume, DeviceVolume)
 _SHEARED_DEGREES = 0.1
 """Angle of shear below which distances along the axes are those in the patient, to a part in 500,000."""
 
-_DISTRIBUTIONS = {"skimage": "scikit-image"}
-"""Name of the distribution of a module, where it differs."""
-
 ITK_TIME_STEP = 0.0625
 """Largest stable time step of curvature flow in three dimensions, for steps of 1 mm and more."""
-
-
-_INSTALLED_AS = {"skimage": "scikit-image"}
-"""Names that packages have for pip, where these differ from their modules."""
 
 
 @dataclass(frozen=True)
@@ -122,9 +115,9 @@ def filter_volume(
     else:
         if device is not None or memory is not None:
             raise UsageError(f"{name} runs on the computer's processor: leave out device and memory")
-        voxels, facts = denoiser.run(_import_package(name, denoiser.package), source, asked)
+        voxels, facts = denoiser.run(import_package(denoiser.package, f"the filter {name}"), source, asked)
         top = denoiser.package.split(".")[0]
-        facts["package"] = f"{top} {metadata.version(_DISTRIBUTIONS.get(top, top))}"
+        facts["package"] = f"{top} {metadata.version(package_of(top))}"
     tell("filter", nk, nk)
     filtered = report_filter(source, _as_voxels(voxels, source), {"filter": name, **facts}, warnings)
     return filtered if resident is None else resident.follow(filtered)  # type: ignore[return-value]
@@ -167,15 +160,6 @@ def _check_volume(volume: Volume, name: str, denoiser: _Denoiser) -> None:
         raise UsageError(
             f"{why}, and {name} takes them for even steps at right angles: filter_bilateral and non-local-means do not"
         )
-
-
-def _import_package(name: str, module: str) -> Any:
-    try:
-        return import_module(module)
-    except ImportError as error:
-        package = module.split(".")[0]
-        command = install_command(_INSTALLED_AS.get(package, package))
-        raise UsageError(f"the filter {name} needs the package {package}: {command}") from error
 
 
 def _as_voxels(result: NDArray[Any], volume: Volume) -> NDArray[Any]:

@@ -32,6 +32,7 @@ from clrecon.operators.surface.extract import SurfaceExtractor
 from clrecon.operators.surface.seeds import AUTO
 from clrecon.system.arguments import MethodName, VertexRule, explains_arguments, name_parameter
 from clrecon.system.light_dataclass import dataclass
+from clrecon.system.packages import import_package
 from clrecon.system.progress import Progress
 
 CORNERS = np.array([(c & 1, c >> 1 & 1, c >> 2) for c in range(8)])
@@ -271,15 +272,12 @@ def _extract_on_host(volume: Volume | DeviceVolume, iso_value: Level, method: st
 
 def _extract_by_skimage(volume: Volume, rule: IsoRule) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
     """Extract by scikit-image in voxels, and place the vertices by the geometry of the scan, uneven slices included."""
-    try:
-        from skimage.measure import marching_cubes
-    except ImportError as error:
-        raise UsageError(f"{name_parameter('method', 'skimage')} needs scikit-image, which is not installed") from error
+    skimage = import_package("skimage.measure", name_parameter("method", "skimage"))
     values = volume.voxels.astype(np.float32)
     if rule.closed:
         values = np.pad(values, 1, constant_values=np.float32(rule.outside))
     try:
-        points, faces, _, _ = marching_cubes(values, rule.iso_level, allow_degenerate=False)
+        points, faces, _, _ = skimage.marching_cubes(values, rule.iso_level, allow_degenerate=False)
     except (ValueError, RuntimeError) as error:
         runs = describe_range(volume, *data_range(volume))
         raise NoSurfaceError(f"no surface {rule.phrase()}: {runs}") from error

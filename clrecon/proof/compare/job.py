@@ -118,7 +118,7 @@ def make_comparison(
     progress = progress or ignore_progress
     watch = Laps()
     truth = None if settings.truth is None else _check_truth(Path(settings.truth))
-    import_package("matplotlib.figure", "the page of a comparison", "matplotlib")
+    import_package("matplotlib.figure", "the page of a comparison")
     with keep_existing(keep=no_clobber):
         folder = check_report_folder(output)
     check_kept([("the report", output)], source, settings.truth)

@@ -227,11 +227,8 @@ class GridFile:
         return f"slice {k + 1} of {self.shape_ijk[2]}"
 
 
-_PACKAGES = {"nrrd": "pynrrd"}
-
-
 def import_extra(module: str, purpose: str) -> Any:
-    return import_package(module, f"this {purpose}", _PACKAGES.get(module))
+    return import_package(module, f"this {purpose}")
 
 
 PACKING = 1

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from clrecon.errors import UsageError
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.light_dataclass import dataclass
+from clrecon.system.packages import import_package
 from clrecon.system.records import Record
 
 WINDOW = 7
@@ -81,9 +82,8 @@ def measure_pictures(
     )
     given, wanted = given[top:bottom, left:right], wanted[top:bottom, left:right]
     difference = given.astype(np.float64) - wanted
-    from skimage.metrics import structural_similarity
-
-    similarity = float(structural_similarity(given, wanted, win_size=WINDOW, data_range=RANGE, channel_axis=2))
+    metrics = import_package("skimage.metrics", "measure_pictures")
+    similarity = float(metrics.structural_similarity(given, wanted, win_size=WINDOW, data_range=RANGE, channel_axis=2))
     return PictureLikeness(float(np.mean(difference * difference)), similarity, (top, left, bottom, right))
 
 
