@@ -126,6 +126,14 @@ static inline uint ring_after(const patch *own, const uint i) { return i + 1u ==
 
 static inline float3 ring_place(const patch *own, const uint i) { return (float3)(own->x[i], own->y[i], own->z[i]); }
 
+/* The end of the edge that face i of the fan had.  By numbers: of a choice of two vectors compilers make one of addresses,
+ * and keep both in memory. */
+static inline float3 end_of_edge(const patch *own, const uint i)
+{
+    const int at_u = i < own->split;
+    return (float3)(at_u ? own->u.x : own->w.x, at_u ? own->u.y : own->w.y, at_u ? own->u.z : own->w.z);
+}
+
 static inline void put_in_ring(patch *own, const uint i, const float3 place)
 {
     own->x[i] = place.x;
@@ -176,7 +184,7 @@ static inline int place_vertex(patch *own, const quadric sum)
     normal += other;
     volume += dot3(other, own->w);
     for (uint i = 0; i < own->size; ++i) {
-        const float3 from = i < own->split ? own->u : own->w;
+        const float3 from = end_of_edge(own, i);
         const float3 one = ring_place(own, i), two = ring_place(own, i + 1u);
         const float3 of = cross3(one - from, two - from);
         normal += of;
@@ -196,7 +204,7 @@ static inline int keeps_normals(const patch *own)
 {
     int keeps = 1;
     for (uint i = 0; keeps && i < own->size; ++i) {
-        const float3 from = i < own->split ? own->u : own->w;
+        const float3 from = end_of_edge(own, i);
         const float3 one = ring_place(own, i), two = ring_place(own, i + 1u);
         const float3 before = cross3(one - from, two - from), now = cross3(one - own->place, two - own->place);
         const float3 p = one - own->place, q = two - own->place, r = two - one, s = one - from, t = two - from;
@@ -323,7 +331,7 @@ static inline void rehang_points(
 
 /* Square of the distance from a point to a face of the given surface near it, less than `limit` if that is seen from
  * the vertex `home`; below `enough` nothing nearer is looked for.  `home` becomes a vertex near the point. */
-static inline float square_to_given(
+static inline __attribute__((always_inline)) float square_to_given(
     const target *to, const float3 point, const float limit, const float enough, uint *home, int *near_face)
 {
     float least = *near_face == NO_FACE ? MAXFLOAT : square_to(to, point, *near_face);

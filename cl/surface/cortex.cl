@@ -138,7 +138,7 @@ typedef struct {
     floats x0, t, outer, cortex, inner, cost, samples, xx, xt, tt, to_x, to_t;
 } wall_fit;
 
-static inline wall_fit fit_plateaus(const wall_profiles *p, const floats x0, const floats t)
+static inline __attribute__((always_inline)) wall_fit fit_plateaus(const wall_profiles *p, const floats x0, const floats t)
 {
     floats oo = (floats)(p->keep_outer), kk = (floats)(p->keep_cortex), ii = (floats)(p->keep_inner);
     floats ok = (floats)(0.0f), oi = ok, ki = ok, yo = ok, yk = ok, yi = ok, yy = ok;

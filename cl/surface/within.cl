@@ -132,13 +132,16 @@ static inline int is_near_all(const target *to, const triangle *piece, const int
     return all(is_near.lo) | all(is_near.hi) << 1;
 }
 #else
-static inline int is_near_one(const target *to, const triangle *piece, const int face, const float limit)
+/* Inlined: a piece that is handed to a function lies in memory. */
+static inline __attribute__((always_inline)) int is_near_one(
+    const target *to, const triangle *piece, const int face, const float limit)
 {
     return square_to(to, piece->a, face) < limit && square_to(to, piece->b, face) < limit
         && square_to(to, piece->c, face) < limit;
 }
 
-static inline int is_near_all(const target *to, const triangle *piece, const int face, const int other, const float limit)
+static inline __attribute__((always_inline)) int is_near_all(
+    const target *to, const triangle *piece, const int face, const int other, const float limit)
 {
     const int first = is_near_one(to, piece, face, limit);
     return first | (int)(!first && other != face && is_near_one(to, piece, other, limit)) << 1;
@@ -148,7 +151,7 @@ static inline int is_near_all(const target *to, const triangle *piece, const int
 /* Walk from a vertex to a face that is nearest among all that touch it, or nearer than `enough`; the square of its
  * distance.  Within the limit only those around one corner are looked at, unless `enough` is 0.  (rusticl of Mesa 22 goes
  * wrong where such a loop ends in its middle.) */
-static inline float walk_to(
+static inline __attribute__((always_inline)) float walk_to(
     const target *to, const float3 point, const int from, const float limit, const float enough, int *nearest)
 {
     float least = MAXFLOAT;
