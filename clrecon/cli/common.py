@@ -332,7 +332,10 @@ def _parse_seconds(text: str) -> float:
     return float(text)
 
 
-GRID_FILE = "a NIfTI, NRRD or MetaImage file; or a zip or tar file or URL of them (dicomweb+https://, s3://, https://)"
+GRID_FILE = (
+    "a NIfTI, NRRD or MetaImage file or OME-Zarr folder; or a zip or tar file or URL of them (dicomweb+https://, s3://,"
+    " https://)"
+)
 SCAN_FOLDER = "DICOM folder (subfolders and any file names are fine) or file"
 SCAN = f"DICOM folder or file, or {GRID_FILE}"
 

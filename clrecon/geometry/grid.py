@@ -27,7 +27,7 @@ from clrecon.geometry.affine import (
 from clrecon.geometry.certificate import Certificate, amend
 from clrecon.system.base_classes import MappedArray, Message
 from clrecon.system.light_dataclass import dataclass
-from clrecon.system.memory import find_mapping
+from clrecon.system.memory import allocate_voxels, find_mapping, iterate_layers
 
 
 def may_change(array: NDArray[Any]) -> bool:
@@ -227,10 +227,27 @@ def _as_array(voxels: ArrayLike) -> NDArray[Any]:
 
         if isinstance(voxels, masked.MaskedArray) and masked.is_masked(voxels):
             raise UsageError("masked voxels: fill them first, for CT with voxels.filled(clrecon.geometry.AIR_HU)")
+    if getattr(voxels, "ndim", 0) == 3 and getattr(voxels, "chunks", None) and 0 not in voxels.shape:  # type: ignore[union-attr]
+        return _read_chunked(voxels)
     try:
         return np.asarray(voxels)
     except ValueError as error:
         raise UsageError(f"voxels are no array of numbers: {error}") from error
+
+
+def _read_chunked(source: Any) -> NDArray[Any]:
+    """Read an array of zarr, Dask or h5py by layers of its chunks, in the type of a volume."""
+    voxels = mapping = None
+    for first, end in iterate_layers(source):
+        layer = _device_ready(np.asarray(source[first:end]))
+        if voxels is None:
+            voxels = allocate_voxels(source.shape, layer.dtype, may_map=True)
+            mapping = find_mapping(voxels)
+        voxels[first:end] = layer
+        if mapping is not None:
+            mapping.release(voxels[first:end])
+    assert voxels is not None  # it is not empty
+    return voxels
 
 
 def _value_range(voxels: NDArray[Any]) -> tuple[float, float] | None:

@@ -34,7 +34,8 @@ class Volume(BaseVolume, ShownAsHtml):
     voxels : array_like, shape (nk, nj, ni)
         One value a voxel, indexed ``voxels[k, j, i]``: i runs along a DICOM row (the column index), j over the
         rows, k over the slices.  int8, uint8, int16, uint16, int32 and float32 are kept as they are (and not
-        copied when C-contiguous); bool becomes uint8, other floats float32, other integers int32.
+        copied when C-contiguous); bool becomes uint8, other floats float32, other integers int32.  An array of zarr,
+        Dask or h5py is read by layers of its chunks, into a temporary file where the free memory is too small.
     affine : array_like, shape (4, 4)
         Index (i, j, k) to LPS mm, see ``clrecon.geometry.affine``.
     report : dict, optional

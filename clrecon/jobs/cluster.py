@@ -44,6 +44,9 @@ _SETTINGS: Mapping[str, Any] = {
     "distributed.worker.memory.terminate": False,
 }
 
+_QUIET: Mapping[str, Any] = {"distributed.admin.large-graph-warning-threshold": "1 TB"}
+"""Voxels are sent with their tasks: Dask would advise on each from 10 MB on."""
+
 WITHOUT_DASK_DEFAULTS: Mapping[str, str | None] = {"MALLOC_TRIM_THRESHOLD_": None}
 """Variables of Dask's workers that processes started by them do without."""
 
@@ -171,6 +174,7 @@ def open_cluster(
 
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters is an error here, or a result
     with ExitStack() as stack:
+        stack.enter_context(dask.config.set(_QUIET))
         if address == LOCAL:
             stack.enter_context(dask.config.set(_SETTINGS))
             connected = stack.enter_context(_start_workers(distributed, devices))

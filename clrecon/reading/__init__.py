@@ -20,9 +20,11 @@ if TYPE_CHECKING:
     from clrecon.reading.common.source_facts import SeriesListing
     from clrecon.system.progress import Progress
 
-_OTHER_FORMATS = ("NIfTI", "NRRD", "MetaImage")
-_NAMES = (".nii", ".nii.gz", ".hdr", ".img", ".img.gz", ".nrrd", ".nhdr", ".mha", ".mhd")
+_OTHER_FORMATS = ("NIfTI", "NRRD", "MetaImage", "OME-Zarr")
+_NAMES = (".nii", ".nii.gz", ".hdr", ".img", ".img.gz", ".nrrd", ".nhdr", ".mha", ".mhd", ".zarr")
 """File extensions of these formats, only for messages."""
+_ZARR_METADATA = ("zarr.json", ".zgroup", ".zarray", ".zattrs")
+"""Files in a folder of Zarr, version 3 or 2."""
 
 
 def read_selected(path: Source, selection: Selection, *, progress: Progress | None = None) -> Volume:
@@ -69,14 +71,15 @@ def read_volume(
     rescale: tuple[float, float] | None = None,
     progress: Progress | None = None,
 ) -> Volume:
-    """Read a volume in HU and LPS mm, from DICOM or from a NIfTI, NRRD or MetaImage file.
+    """Read a volume in HU and LPS mm, from DICOM, NIfTI, NRRD, MetaImage or OME-Zarr.
 
     Parameters
     ----------
     path : str, path-like, bytes or sequence of bytes
         A folder of DICOM files, searched with its subfolders; one DICOM file; or a file with a grid and its affine:
         NIfTI (.nii, .nii.gz, .hdr with .img), NRRD (.nrrd, .nhdr), MetaImage (.mha, .mhd), which needs the
-        package SimpleITK; or a zip or tar file of these.  Told from the content.  A text such as
+        package SimpleITK; a folder of OME-Zarr, which needs zarr; or a zip or tar file of these.  Told from the
+        content.  A text such as
         ``dicomweb+https://HOST/studies/UID/series/UID`` or ``s3://bucket/folder/`` is a URL; bytes are the content of
         one file, or of several, such as the instances of a series.
     series : int or str, optional
@@ -172,25 +175,30 @@ def _refuse_options(kind: str, selection: Selection) -> None:
     options = {field.name: getattr(selection, field.name) for field in fields(Selection) if field.name != "rescale"}
     given = [name for name, value in options.items() if value is not None and value is not False]
     if given:
-        raise UsageError(f"{' and '.join(given)}: only for DICOM, the input is a {kind} file")
+        raise UsageError(f"{' and '.join(given)}: only for DICOM, and the input is {kind}")
 
 
 def tell_format(path: str | os.PathLike[str]) -> str | None:
-    """Return the format of a file other than DICOM; None leaves the input and its errors to the DICOM reader."""
+    """Return the format of an input other than DICOM; None leaves the input and its errors to the DICOM reader."""
     try:
         file = Path(path)
-        if not os.fspath(path).strip() or not file.is_file():  # a folder, a missing file, a device
-            return None
-        from clrecon.reading.grids import tell_kind  # which a folder does not need
+        is_given, is_file = bool(os.fspath(path).strip()), file.is_file()
+        kind = None
+        if is_given and is_file:
+            from clrecon.reading.grids import tell_kind  # which a folder does not need
 
-        kind = tell_kind(file)
+            kind = tell_kind(file)
+        elif is_given and any((file / name).exists() for name in _ZARR_METADATA):
+            kind = "OME-Zarr"
+        name = file.name.lower()
+        is_named = name.endswith(_NAMES) if is_file else name.endswith(".zarr") and file.is_dir()
     except (TypeError, ValueError, OSError):
         return None
     if kind in _OTHER_FORMATS:
         return kind
-    if kind is None and file.name.lower().endswith(_NAMES):
-        pair = "; of a NIfTI pair give the .hdr" if file.name.lower().endswith((".img", ".img.gz")) else ""
+    if kind is None and is_named:
+        pair = "; of a NIfTI pair give the .hdr" if name.endswith((".img", ".img.gz")) else ""
         raise RefusedInputError(
-            f"{escape_text(file.name)} is no NIfTI, NRRD or MetaImage file, whatever its name says{pair}"
+            f"{escape_text(file.name)} is no NIfTI, NRRD, MetaImage or OME-Zarr file, whatever its name says{pair}"
         )
     return None

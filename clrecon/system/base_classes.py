@@ -87,5 +87,6 @@ def _pack(value: object) -> object:
 
 
 def _receive(array: NDArray[Any], writeable: bool) -> NDArray[Any]:
-    array.flags.writeable = writeable
+    if not writeable:  # a received array is writeable, and numpy may refuse to set that anew
+        array.flags.writeable = False
     return array

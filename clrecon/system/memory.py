@@ -1,7 +1,7 @@
 """Memory for voxels, checked before it is taken: a small file that claims huge dimensions cannot fill the computer.
 
 A container or service (Linux control groups) has a limit too.  Voxels in a memory-mapped file can be released from
-memory, and found in their file.
+memory, and found in their file; what is larger than the free memory goes to such a file, which has no name.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ import math
 import mmap
 import os
 import stat
+import sys
+import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,9 @@ from clrecon.system.light_dataclass import dataclass
 
 _MEMORY_SHARE = 0.9
 """Share of the free memory that voxels may take; the rest is for what is computed beside the volume."""
+
+_DISK_SHARE = 0.9
+"""Share of the free disk that a temporary file may take."""
 
 
 def available_memory_bytes(proc: Path = Path("/proc"), groups: Path = Path("/sys/fs/cgroup")) -> float:
@@ -48,18 +53,69 @@ def physical_memory_bytes() -> float:
         return math.inf
 
 
-def allocate_voxels(shape: Sequence[int], dtype: DTypeLike, name: str = "") -> NDArray[Any]:
-    """Return an uninitialised array for a volume (nk, nj, ni), see `aligned_empty`; `name` is that of the file."""
+def allocate_voxels(shape: Sequence[int], dtype: DTypeLike, name: str = "", *, may_map: bool = False) -> NDArray[Any]:
+    """Return an uninitialised array for a volume (nk, nj, ni), see `aligned_empty`; `name` is that of the file.
+
+    may_map: An array that is larger than the free memory is mapped from a temporary file.
+    """
     needed = math.prod(shape) * np.dtype(dtype).itemsize
     available = available_memory_bytes()
     size = " x ".join(map(str, reversed(shape)))
     need = f"{name}{': ' * bool(name)}the volume of {size} voxels needs {needed / 2**30:.2f} GiB of memory"
     if needed > _MEMORY_SHARE * available:
-        raise RefusedInputError(f"{need}, {available / 2**30:.2f} GiB are free")
+        problem = f"{need}, {available / 2**30:.2f} GiB are free"
+        if not may_map:
+            raise RefusedInputError(problem)
+        return _map_temporary(shape, np.dtype(dtype), needed, problem)
     try:
         return aligned_empty(shape, dtype)
     except MemoryError as error:
         raise RefusedInputError(f"{need}, which cannot be had") from error
+
+
+def _map_temporary(shape: Sequence[int], dtype: np.dtype[Any], needed: int, problem: str) -> NDArray[Any]:
+    """Map a new file without a name, whose room on the disk is taken before anything is written."""
+    from shutil import disk_usage
+
+    folder = tempfile.gettempdir()
+    advice = "and the folder for temporary files has no room for it: name another with TMPDIR"
+    if needed > _DISK_SHARE * disk_usage(folder).free:
+        raise RefusedInputError(f"{problem}, {advice}")
+    try:
+        with tempfile.TemporaryFile(prefix="clrecon-", dir=folder) as file:
+            if hasattr(os, "posix_fallocate"):
+                os.posix_fallocate(file.fileno(), 0, needed)
+            return np.memmap(file, dtype, "r+", shape=tuple(shape))
+    except OSError as error:
+        raise RefusedInputError(f"{problem}, {advice} ({error.strerror or error})") from error
+
+
+_MAP_NORESERVE = 0x4000
+"""Of Linux on x86 and ARM; Python names it from 3.13 on."""
+
+
+def unreserved_zeros(shape: Sequence[int], dtype: DTypeLike) -> NDArray[Any]:
+    """Return an array of zeros of which only written pages take memory; on Linux it may be larger than the memory."""
+    if sys.platform != "linux":
+        return np.zeros(shape, dtype)
+    flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | _MAP_NORESERVE
+    pages = mmap.mmap(-1, math.prod(shape) * np.dtype(dtype).itemsize, flags=flags)
+    return np.frombuffer(pages, dtype).reshape(shape)
+
+
+_READ_BYTES, _MOST_READ_BYTES = 2**26, 2**29
+"""Bytes of whole layers of chunks that are read at a time, and of parts of a layer; parts unpack a chunk again."""
+
+
+def iterate_layers(source: Any, axis: int = 0) -> Iterator[tuple[int, int]]:
+    """Yield first and end of the slices along an axis of an array of zarr, Dask or h5py that are read at a time."""
+    count = source.shape[axis]
+    slice_bytes = max(1, math.prod(source.shape) * source.dtype.itemsize // count)
+    along = (getattr(source, "shards", None) or source.chunks)[axis]
+    thickness = along if isinstance(along, int) else max(along)
+    step = min(thickness * max(1, _READ_BYTES // (thickness * slice_bytes)), max(1, _MOST_READ_BYTES // slice_bytes))
+    for first in range(0, count, step):
+        yield first, min(first + step, count)
 
 
 _FILES = {  # Of a version of control groups: the files of limit and use, and the reclaimable field of memory.stat.

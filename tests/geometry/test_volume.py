@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import subprocess
 import sys
 
@@ -13,6 +14,7 @@ from refusals import refused
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.grid import DEVICE_DTYPES
+from clrecon.system import memory
 
 OBLIQUE = np.array([[0.7, 0.1, 0.05, -250.0], [-0.1, 0.5, 0.2, -300.0], [0.0, 0.05, 2.5, -846.0], [0, 0, 0, 1.0]])
 
@@ -60,6 +62,45 @@ def test_voxels_of_other_types_are_converted_with_their_values(given, kept):
     volume = Volume(voxels, np.eye(4))
     assert volume.voxels.dtype == np.dtype(kept)
     assert np.array_equal(volume.voxels, voxels)
+
+
+def make_dask_array(voxels):
+    return pytest.importorskip("dask.array").from_array(voxels, chunks=(2, 3, 3))
+
+
+def make_zarr_array(voxels):
+    return pytest.importorskip("zarr").array(voxels, chunks=(2, 3, 3))
+
+
+class ArrayOfHdf5:
+    """An array in chunks that gives its slices alone, and as which h5py's are read."""
+
+    def __init__(self, voxels):
+        self._voxels, self.chunks = voxels, (2, 3, 3)
+        self.shape, self.dtype, self.ndim = voxels.shape, voxels.dtype, voxels.ndim
+
+    def __getitem__(self, slices):
+        return self._voxels[slices]
+
+
+@pytest.mark.parametrize("make_array", [make_dask_array, make_zarr_array, ArrayOfHdf5])
+@pytest.mark.parametrize("is_larger_than_memory", [False, True], ids=["in memory", "in a file"])
+@pytest.mark.parametrize(("given", "kept"), [("int16", "int16"), ("float64", "float32"), ("bool", "uint8")])
+def test_array_in_chunks_becomes_the_volume_of_its_values(make_array, is_larger_than_memory, given, kept, monkeypatch):
+    voxels = np.random.default_rng(5).integers(0, 2, (7, 5, 4)).astype(given)
+    if is_larger_than_memory:
+        monkeypatch.setattr(memory, "available_memory_bytes", lambda: 1)
+    volume = Volume(make_array(voxels), np.eye(4))
+    assert volume.dtype == kept
+    assert np.array_equal(volume.voxels, voxels)
+    assert (memory.find_mapping(volume.voxels) is not None) == is_larger_than_memory
+
+
+def test_volume_in_a_file_without_a_name_is_sent_with_its_values(monkeypatch):
+    voxels = np.random.default_rng(5).integers(-1024, 3000, (7, 5, 4)).astype(np.int16)
+    monkeypatch.setattr(memory, "available_memory_bytes", lambda: 1)
+    volume = Volume(make_dask_array(voxels), np.eye(4))
+    assert np.array_equal(pickle.loads(pickle.dumps(volume)).voxels, voxels)
 
 
 def test_integers_are_kept_up_to_the_ends_of_32_bits():

@@ -12,8 +12,8 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 100_051,
-    "modules": 437,
+    "lines": 100_417,
+    "modules": 438,
     "small_modules_with_one_reader": 8,
     "docstrings_with_raises": 139,
     "options_in_several_files": 8,

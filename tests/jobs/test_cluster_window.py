@@ -7,11 +7,12 @@ from collections.abc import Callable
 from concurrent.futures import CancelledError
 from typing import Any
 
+import numpy as np
 import pytest
 from refusals import refused
 
 from clrecon.errors import NoSurfaceError, UnreachableError, UsageError
-from clrecon.jobs.cluster import Cluster, Died, check_address
+from clrecon.jobs.cluster import Cluster, Died, check_address, open_cluster
 from clrecon.version import package_version
 
 WORKERS = 3
@@ -141,3 +142,16 @@ def test_scheduler_lost_while_a_result_is_fetched_is_an_error_with_its_address(f
 def test_word_that_is_no_address_of_a_scheduler_is_refused(address: str) -> None:
     with refused(ValueError, address):
         check_address(address)
+
+
+@pytest.mark.filterwarnings("error")
+def test_task_with_many_voxels_is_sent_without_advice_of_dask() -> None:
+    distributed = pytest.importorskip("distributed")
+    voxels = np.ones(11_000_000, np.uint8)  # Dask's threshold is 10 MB
+    with (
+        distributed.LocalCluster(n_workers=1, processes=False, protocol="tcp", dashboard_address=None) as local,
+        open_cluster(local.scheduler_address, []) as cluster,
+    ):
+        [(sent, is_equal)] = cluster.run_tasks(np.array_equal, [voxels], voxels[:3])
+    assert sent is voxels
+    assert not is_equal

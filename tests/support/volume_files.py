@@ -1,10 +1,11 @@
-"""CT volumes in every format that is read, written by nibabel, by pynrrd, and MetaImage by hand from its definition."""
+"""CT volumes in every format that is read, written by nibabel, pynrrd and zarr, and MetaImage by hand."""
 
 from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from label_files import OBLIQUE, write_nifti, write_nrrd
@@ -85,3 +86,41 @@ WRITERS: dict[str, Callable[..., Path]] = {
     "packed.mhd": lambda *args: write_metaimage(*args, packed=True),
 }
 """A name of each kind of file to the function that writes it: ``write(path, voxels, affine)``."""
+
+
+PATIENT = {"x": "right-to-left", "y": "anterior-to-posterior", "z": "inferior-to-superior"}
+"""Orientation (RFC-4 of OME-Zarr) of axes in LPS."""
+
+
+def make_axes(names: str = "zyx", *, unit: str | None = "millimeter", orientation: bool = True) -> list[dict[str, Any]]:
+    """The axes of OME-Zarr metadata, one letter each; x, y and z are of space."""
+    axes = []
+    for name in names:
+        axis: dict[str, Any] = {"name": name, "type": {"t": "time", "c": "channel"}.get(name, "space")}
+        if name in PATIENT and unit is not None:
+            axis["unit"] = unit
+        if name in PATIENT and orientation:
+            axis["orientation"] = {"type": "anatomical", "value": PATIENT[name]}
+        axes.append(axis)
+    return axes
+
+
+def write_ome_zarr(
+    path: Path,
+    voxels: np.ndarray,
+    *,
+    axes: list[dict[str, Any]] | None = None,
+    place: Sequence[dict[str, Any]] = ({"type": "scale", "scale": [2.5, 0.75, 0.5]},),
+    version: int = 3,
+    **storage: Any,
+) -> Path:
+    """Write an array as OME-Zarr 0.5, or 0.4 for Zarr 2; `place` are its coordinate transformations."""
+    import zarr
+
+    image = {"axes": axes or make_axes(), "datasets": [{"path": "0", "coordinateTransformations": list(place)}]}
+    old, new = {"multiscales": [{**image, "version": "0.4"}]}, {"ome": {"version": "0.5", "multiscales": [image]}}
+    group = zarr.create_group(str(path), zarr_format=version, attributes=old if version == 2 else new)
+    chunks = tuple(min(4, count) for count in voxels.shape)
+    own: Any = {"shape": voxels.shape, "dtype": voxels.dtype, "chunks": chunks} | storage
+    group.create_array("0", **own)[...] = voxels
+    return path

@@ -51,6 +51,32 @@ def test_volume_larger_than_the_free_memory_is_refused_with_both_in_gib(monkeypa
     assert str(caught.value) == f"a.nii: {needed}, 1.00 GiB are free"
 
 
+class Chunked:
+    """The shape of an array of int16 and that of its chunks, as zarr or Dask says it."""
+
+    dtype = np.dtype(np.int16)
+
+    def __init__(self, shape: tuple[int, ...], chunks: tuple[Any, ...]):
+        self.shape, self.chunks = shape, chunks
+
+
+@pytest.mark.parametrize(
+    ("source", "slices"),
+    [
+        (Chunked((200, 1024, 1024), (64, 64, 64)), 64),  # a layer has 128 MiB: one at a time
+        (Chunked((200, 1024, 1024), (1, 1024, 1024)), 32),  # as many as 64 MiB have
+        (Chunked((200, 1024, 1024), ((100, 60, 40), (1024,), (1024,))), 100),
+        (Chunked((200, 8192, 8192), (64, 64, 64)), 4),  # of a layer of 8 GiB as much as 512 MiB have
+    ],
+    ids=["layer", "thin layers", "uneven layers", "part of a layer"],
+)
+def test_chunked_array_is_read_by_whole_layers_as_far_as_they_are_small(source: Chunked, slices: int) -> None:
+    parts = [*memory.iterate_layers(source)]
+    assert parts[0] == (0, slices)
+    assert [first for first, _ in parts[1:]] == [end for _, end in parts[:-1]]
+    assert parts[-1][1] == source.shape[0]
+
+
 def test_volume_that_fits_into_the_free_memory_is_allocated() -> None:
     voxels = memory.allocate_voxels((2, 3, 4), np.int16)
     assert (voxels.shape, voxels.dtype) == ((2, 3, 4), np.int16)

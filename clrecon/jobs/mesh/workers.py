@@ -75,6 +75,7 @@ class ClusterSpans:
         for item, part in self._cluster.run_tasks(make_on_worker, sent, facts, self._memory):
             if isinstance(part, Died):
                 raise DeviceError(f"slices {item.span[0]} to {item.span[1] - 1} cannot be done: {part.message}")
+            volume.release_slices(item.first_slice, item.first_slice + len(item.voxels))
             yield item.span, part
 
 

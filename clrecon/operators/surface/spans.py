@@ -26,6 +26,7 @@ from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface.extraction import Extraction, Part, SpanPart, choose_grid
 from clrecon.operators.surface.marching_cubes import too_many
 from clrecon.operators.surface.slabs import SampleGrid, Slab
+from clrecon.system.memory import unreserved_zeros
 from clrecon.system.pieces import find_bounds
 from clrecon.system.progress import Progress, ignore_progress
 
@@ -225,7 +226,7 @@ def cut_voxels(grid: SampleGrid, span: Span) -> SentSpan:
 
 def make_sent_span(sent: SentSpan, facts: GridFacts, device: Device, memory: int | None) -> SpanPart:
     """Make a part of a surface from the voxels that were sent; of the others no page is touched."""
-    voxels = np.empty(facts.shape, sent.voxels.dtype)
+    voxels = unreserved_zeros(facts.shape, sent.voxels.dtype)
     voxels[sent.first_slice : sent.first_slice + len(sent.voxels)] = sent.voxels
     volume = Volume(voxels, facts.affine, slice_positions=facts.slice_positions)
     with DeviceVolume(volume, device=device, memory=memory) as resident:

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from math import prod
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Any, BinaryIO, cast
+from typing import Any, BinaryIO, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,8 +30,11 @@ from clrecon.system.text import escape_text
 _DEFLATE_RATIO = 1032
 """Highest compression ratio of Deflate (zlib's technical note)."""
 
-_LARGEST_GRID = 2**32
-"""Most voxels of a grid: 1000 slices of 2048 x 2048."""
+_LARGEST_GRID = 2**36
+"""Most voxels of a grid: 4096 slices of 4096 x 4096."""
+
+_SCAN_RATIO = 100
+"""Highest compression ratio of scans, whose air packs well; beyond, a file may be made to fill the disk."""
 
 _LARGEST_SLICE_BYTES = 2**28
 """Most stored bytes of a slice; slices are inflated one at a time."""
@@ -40,6 +43,23 @@ _LARGEST_SURPLUS = 4096
 """Most bytes that may follow the last number: some writers fill up a block."""
 
 _CHUNK = 2**18
+
+
+class VoxelSource(Protocol):
+    """Where the numbers of a grid are: in a file (`VoxelBytes`), or in the chunks of a folder.
+
+    file_bytes: Stored bytes, from which `check_size` tells whether the grid can be there.
+    """
+
+    @property
+    def path(self) -> Path: ...
+    @property
+    def compressed(self) -> bool: ...
+    @property
+    def file_bytes(self) -> int: ...
+
+    def iterate_slices(self, grid: GridFile) -> Iterator[NDArray[Any]]:
+        """See `GridFile.iterate_slices`."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +82,16 @@ class VoxelBytes:
     @property
     def file_bytes(self) -> int:
         return self.path.stat().st_size
+
+    def iterate_slices(self, grid: GridFile) -> Iterator[NDArray[Any]]:
+        ni, nj, nk = grid.shape_ijk
+        shape = (nj, ni) if grid.layers == 1 else (nj, ni, grid.layers)
+        count = nj * ni * grid.layers * grid.dtype.itemsize
+        with self.open(grid.name) as stream:
+            for k in range(nk):
+                raw = read_bytes(stream, count, grid.name, grid.place(k))
+                yield np.frombuffer(raw, dtype=grid.dtype).reshape(shape)
+            check_end(stream, grid.name)
 
     @contextmanager
     def open(self, name: str) -> Iterator[BinaryIO]:
@@ -177,7 +207,7 @@ class GridFile:
     """A grid of numbers in a file.
 
     name: Of the file, for messages on the terminal; it is never written to reports.
-    kind: "NIfTI-1", "NIfTI-2", "NRRD" or "MetaImage".
+    kind: "NIfTI-1", "NIfTI-2", "NRRD", "MetaImage" or "OME-Zarr".
     layers: Numbers of one voxel, side by side in the file; 1 except for layered label maps.
     dtype: Type as stored, with its byte order.
     slope, intercept: The value of a stored number is ``stored * slope + intercept``; the user may have given them.
@@ -191,7 +221,7 @@ class GridFile:
     shape_ijk: tuple[int, int, int]
     dtype: np.dtype[Any]
     affine: Float64Array
-    voxel_bytes: VoxelBytes
+    voxel_bytes: VoxelSource
     slope: float = 1.0
     intercept: float = 0.0
     layers: int = 1
@@ -209,17 +239,16 @@ class GridFile:
         """True when the stored numbers have to be scaled to get the values."""
         return (self.slope, self.intercept) != (1.0, 0.0)
 
+    @property
+    def may_be_mapped(self) -> bool:
+        """True where a volume that is larger than the free memory may go to a file."""
+        stored = self.voxel_bytes.file_bytes
+        return prod(self.shape_ijk) * self.dtype.itemsize <= _SCAN_RATIO * stored
+
     def iterate_slices(self) -> Iterator[NDArray[Any]]:
         """Yield the stored slices in the order of k, shape (nj, ni), with layers (nj, ni, layers); read-only."""
-        ni, nj, nk = self.shape_ijk
-        shape = (nj, ni) if self.layers == 1 else (nj, ni, self.layers)
-        count = nj * ni * self.layers * self.dtype.itemsize
         try:
-            with self.voxel_bytes.open(self.name) as stream:
-                for k in range(nk):
-                    raw = read_bytes(stream, count, self.name, self.place(k))
-                    yield np.frombuffer(raw, dtype=self.dtype).reshape(shape)
-                check_end(stream, self.name)
+            yield from self.voxel_bytes.iterate_slices(self)
         except OSError as error:
             raise RefusedInputError(f"{self.name} cannot be read: {error.strerror or error}") from error
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,10 +31,11 @@ from clrecon.reading.grids.grid_file import VOLUME, GridFile
 from clrecon.reading.grids.metaimage import is_metaimage, open_metaimage
 from clrecon.reading.grids.nifti import is_nifti, open_nifti
 from clrecon.reading.grids.nrrd import is_nrrd, open_nrrd
+from clrecon.reading.grids.zarr_store import open_zarr
 from clrecon.system.arguments import name_parameter
 from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.log import get_logger, log_warnings
-from clrecon.system.memory import allocate_voxels
+from clrecon.system.memory import allocate_voxels, find_mapping
 from clrecon.system.paths import open_regular
 from clrecon.system.progress import Progress
 from clrecon.system.records import Gate, at_most, none_of, unmeasured
@@ -70,9 +71,17 @@ def name_of_grid(path: Path) -> str:
     return re.sub(r"(\.seg)?\.(nii|hdr|nrrd|nhdr|mha|mhd)(\.gz)?$", "", path.name, flags=re.IGNORECASE) or path.name
 
 
+_OPENERS: dict[str, Callable[[Path, str], GridFile]] = {
+    "NIfTI": open_nifti,
+    "NRRD": open_nrrd,
+    "MetaImage": open_metaimage,
+    "OME-Zarr": open_zarr,
+}
+
+
 def open_grid(path: Path, kind: str, purpose: str) -> GridFile:
-    """Read the header of a file of one of the `kind` "NIfTI", "NRRD" and "MetaImage"."""
-    return {"NIfTI": open_nifti, "NRRD": open_nrrd, "MetaImage": open_metaimage}[kind](path, purpose)
+    """Read the header of a file of one of the kinds of `tell_kind`, or of a folder of OME-Zarr."""
+    return _OPENERS[kind](path, purpose)
 
 
 _LADDER = (np.dtype(np.int16), np.dtype(np.int32), np.dtype(np.float32))
@@ -113,10 +122,16 @@ class _Filling:
     def __init__(self, grid: GridFile):
         self._grid = grid
         self._step = 0  # index into _LADDER
-        self._voxels = allocate_voxels(grid.shape_ijk[::-1], _LADDER[0], grid.name)
+        self._voxels = self._allocate()
         self._holes = 0
         self._low = np.inf
         self._high = -np.inf
+
+    def _allocate(self) -> NDArray[Any]:
+        grid = self._grid
+        voxels = allocate_voxels(grid.shape_ijk[::-1], _LADDER[self._step], grid.name, may_map=grid.may_be_mapped)
+        self._mapping = find_mapping(voxels)
+        return voxels
 
     def add(self, k: int, stored: NDArray[Any]) -> None:
         values = _scale(stored, self._grid)
@@ -133,9 +148,11 @@ class _Filling:
             step = self._step_for(k, measured, low, high)
             if step > self._step:
                 narrow, self._step = self._voxels, step
-                self._voxels = allocate_voxels(self._grid.shape_ijk[::-1], _LADDER[step], self._grid.name)
+                self._voxels = self._allocate()
                 self._voxels[:k] = narrow[:k]
         np.copyto(self._voxels[k], values, casting="unsafe")  # the type holds all these values
+        if self._mapping is not None:
+            self._mapping.release(self._voxels[k])
 
     def _step_for(self, k: int, measured: NDArray[Any], low: float, high: float) -> int:
         """Return the index of the first type that holds these values, not below the current one."""
@@ -179,6 +196,8 @@ class _Filling:
         facts = PixelFacts(share, float(low), float(high), filled)
         if disc is not None:
             facts = replace(facts, padding_text=disc.describe(voxels.size), disc=disc.value)
+        if self._mapping is not None:
+            voxels.flags.writeable = False  # its range need not be looked for anew
         return GridValues(voxels, facts, warnings, doubts, _judge_likeness(voxels, self._grid))
 
 

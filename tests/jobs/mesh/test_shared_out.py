@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import sys
@@ -11,16 +12,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from label_files import write_nifti
 from refusals import refused
+from volume_files import write_ome_zarr
 
 from clrecon import Mesh, Volume, extract_isosurface
 from clrecon.cli.main import main
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.jobs.cluster import LOCAL, open_cluster
+from clrecon.jobs.mesh.job import make_mesh
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.workers import ClusterSpans
 from clrecon.opencl import Device, list_devices
 from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.operators.surface.extraction import choose_grid
 from clrecon.operators.surface.slabs import SampleGrid
 from clrecon.operators.surface.spans import (
     DeviceSpans,
@@ -30,8 +35,10 @@ from clrecon.operators.surface.spans import (
     cut_voxels,
     extract_by_spans,
     make_sent_span,
+    make_span,
 )
 from clrecon.proof.phantom import PhantomSettings, write_phantom
+from clrecon.system.memory import physical_memory_bytes
 
 SLICES = 40
 AFFINE = np.array([[0.7, 0, 0.1, -90], [0, 0.7, 0.2, 30], [0, 0, 1.5, 700], [0, 0, 0, 1]], float)
@@ -97,6 +104,21 @@ def test_surface_from_sent_spans_has_the_arrays_of_one_extraction(case: str, dev
     )
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="pages that take no memory until they are written")
+def test_span_of_a_volume_larger_than_memory_is_made_of_its_slices_alone(device: Device) -> None:
+    voxels = np.random.default_rng(1).integers(-1000, 1000, (11, 512, 512)).astype(np.int16)
+    volume = Volume(voxels, AFFINE)
+    span, shape = (3, 9), (500_000, 512, 512)  # 262 GB
+    assert shape[0] * voxels[0].nbytes > physical_memory_bytes()
+    with DeviceVolume(volume, device=device) as resident:
+        grid = choose_grid(resident, 990, closed=True, below=False)
+        expected = make_span(resident, grid, span)
+    facts = GridFacts(shape, volume.affine, None, grid.rule)
+    _, _, triangles, _ = make_sent_span(cut_voxels(grid, span), facts, device, memory=None)
+    assert len(triangles)
+    assert np.array_equal(triangles, expected[2])
+
+
 def test_surface_that_no_span_has_is_refused_like_that_of_one_extraction(device: Device) -> None:
     above_all_values = 5000
 
@@ -133,7 +155,7 @@ def test_surface_that_grows_is_not_shared_out(how: dict[str, str]) -> None:
 def test_surface_of_workers_has_the_arrays_of_one_extraction_when_a_worker_is_killed(device: Device) -> None:
     volume = make_noise()
     killed: list[int] = []
-    with open_cluster(LOCAL, [None]) as cluster, DeviceVolume(volume, device=device) as resident:
+    with open_cluster(LOCAL, [None, None]) as cluster, DeviceVolume(volume, device=device) as resident:
 
         def make_spans(grid: SampleGrid, spans: Sequence[Span]) -> Iterator[tuple[Span, SpanPart]]:
             for number, made in enumerate(ClusterSpans(cluster, memory=None)(grid, spans)):
@@ -143,5 +165,30 @@ def test_surface_of_workers_has_the_arrays_of_one_extraction_when_a_worker_is_ki
                 yield made
 
         mesh = extract_by_spans(resident, 100, make_spans, SPANS, closed=True, below=False)
-        assert [*cluster.call_all(os.getpid)] != killed  # another one has come
+        assert killed[0] not in cluster.call_all(os.getpid)
     assert_same_arrays(mesh, extract_isosurface(volume, 100, device=device))
+
+
+@pytest.mark.seconds
+@pytest.mark.skipif(sys.platform != "linux", reason="SIGKILL")
+def test_mesh_of_ome_zarr_by_workers_is_the_file_of_one_process_and_nifti_when_a_worker_is_killed(
+    tmp_path: Path,
+) -> None:
+    pytest.importorskip("zarr")
+    voxels = make_noise().voxels
+    scan = write_ome_zarr(tmp_path / "a.zarr", voxels)  # steps of 2.5, 0.75 and 0.5 mm along its axes
+    nifti = write_nifti(tmp_path / "a.nii", voxels, np.diag((0.5, 0.75, 2.5, 1.0)))
+    killed: list[int] = []
+
+    def kill_worker(stage: str, done: int, total: int) -> None:
+        if stage == "slabs" and done and not killed:
+            [worker] = multiprocessing.active_children()
+            assert worker.pid is not None
+            killed.append(worker.pid)
+            os.kill(killed[0], signal.SIGKILL)
+
+    make_mesh(nifti, tmp_path / "one.stl", MeshSettings(iso_value=100))
+    settings = MeshSettings(iso_value=100, scheduler=LOCAL)
+    make_mesh(scan, tmp_path / "shared.stl", settings, progress=kill_worker)
+    assert killed
+    assert (tmp_path / "shared.stl").read_bytes() == (tmp_path / "one.stl").read_bytes()

@@ -76,7 +76,7 @@ def test_path_that_is_empty_none_or_missing_is_refused(path, kind, fact):
 @pytest.mark.parametrize("option", [{"series": 1}, {"series": "x"}, {"phase": 2}, {"allow_gaps": True}])
 def test_option_for_dicom_alone_is_refused_for_a_grid_file(tmp_path, option):
     path = WRITERS["a.nii"](tmp_path / "a.nii", make_ct(), OBLIQUE)
-    with pytest.raises(UsageError, match=f"{next(iter(option))}: only for DICOM, the input is a NIfTI file"):
+    with pytest.raises(UsageError, match=f"{next(iter(option))}: only for DICOM, and the input is NIfTI"):
         clrecon.read_volume(path, **option)
 
 
