@@ -29,6 +29,17 @@ def lost_error() -> Exception:
     return Lost("INVALID_COMMAND_QUEUE: injected")
 
 
+def memory_error(code: int) -> Exception:
+    """Return the error of a driver that has no memory for a kernel, with OpenCL's number for it."""
+    cl = import_pyopencl()
+
+    class NoMemory(cl.MemoryError):  # type: ignore[misc, name-defined]
+        pass
+
+    NoMemory.code = code
+    return NoMemory(f"{cl.status_code.to_string(code)}: injected")
+
+
 class Failing:
     """Counts buffers and launches on a device, and lets some of one kind fail, from number `first` to `last`.
 

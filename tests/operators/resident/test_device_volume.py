@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import tolerances
 from device_work import SIZE, WORK, centre_line, label_boxes
-from failing_devices import Failing
+from failing_devices import Failing, memory_error
 from refusals import refused
 from surface_volumes import OBLIQUE, smooth_volume
 from variants import daily_rows, each_value
@@ -79,6 +79,25 @@ def test_a_buffer_that_fails_is_warned_of_with_the_slabs_that_follow(device, vol
         Failing(monkeypatch, "buffer", fails)
         warnings = work(resident).report["warnings"]
     assert any("injected: continued with slabs of" in warning for warning in warnings)
+
+
+@pytest.mark.parametrize("code", [-4, -5], ids=["MEM_OBJECT_ALLOCATION_FAILURE", "OUT_OF_RESOURCES"])
+@pytest.mark.parametrize("work", ["mip", "surface", "slice"])
+def test_work_whose_kernel_gets_no_memory_at_its_launch_is_done_in_slabs_and_says_so(
+    device, volume, monkeypatch, work, code
+):
+    """Drivers of cards find memory for a buffer only when a kernel uses it."""
+    do_work = {
+        "mip": lambda v: clrecon.render(v, "mip", size=SIZE),
+        "surface": lambda v: clrecon.extract_isosurface(v, 100),
+        "slice": lambda v: clrecon.cut_slice(v, "coronal", SIZE),
+    }[work]
+    Failing(monkeypatch, "launch", first=1, error=memory_error(code))
+    with DeviceVolume(volume, device=device) as resident:
+        report = do_work(resident).report
+    assert report["slabs"] > 1
+    (warning,) = (warning for warning in report["warnings"] if "continued with slabs of" in warning)
+    assert str(memory_error(code)) in warning
 
 
 @pytest.mark.parametrize("work", WORK)
