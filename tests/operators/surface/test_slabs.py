@@ -128,9 +128,9 @@ def test_slabs_without_a_surface_between_others_give_the_same_mesh(device):
 def test_a_volume_beyond_the_memory_allowed_goes_through_in_slabs_within_it(device):
     volume = smooth_volume((40, 60, 70))
     expected = extract_isosurface(volume, 100, device=device)
-    memory = volume.voxels.nbytes // 2
+    memory = volume.voxels.nbytes * 3 // 5
     mesh = extract_isosurface(volume, 100, device=device, memory=memory)
-    assert mesh.report["slabs"] > 2  # a half has to hold the voxels and all else; measured 42
+    assert mesh.report["slabs"] > 2  # that has to hold the voxels and all else; measured 21, and 42 with lists of GPUs
     assert sum(mesh.report["device_bytes"].values()) <= memory
     assert_same(mesh, expected)
 
