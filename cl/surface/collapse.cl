@@ -219,6 +219,7 @@ __kernel void select_edges(
  *             limit     mm2: no point may lie farther away
  *             most      mm2: as for `rank_edges`
  *             spacing   mm: points of new edges are no farther apart
+ *             rise      mm: see `is_flat`
  * Launch      global = counts[0] or more, rounded up by the host, local at most GROUP
  * Assumes     as above
  * Guarantees  the surface stays closed, and its volume but for rounding */
@@ -231,7 +232,8 @@ __kernel void collapse_edges(
     __global uint *restrict counts, __global const float *restrict first_places,
     __global const uint *restrict first_corners, __global const int *restrict begin, __global const int *restrict around,
     __global const float4 *restrict frames, __global const float8 *restrict stars, __global const uint *restrict chosen,
-    const uint count, const uint number, const float limit, const float most, const float spacing)
+    const uint count, const uint number, const float limit, const float most, const float spacing,
+    const float rise)
 {
     __local float rings[3 * GROUP * (MOST_RING + 1)];
     __local uint vertices[GROUP * MOST_RING], fans[GROUP * MOST_RING], nears[GROUP * MOST_RING];
@@ -264,12 +266,15 @@ __kernel void collapse_edges(
         home = dot3(away_u, away_u) <= dot3(away_w, away_w) ? home_u : home_w;
         const target surface = {first_places, first_corners, begin, around, frames, stars};
         center_ring(&own);
-        int near_face = NO_FACE;
-        const float square = square_to_given(
-            &surface, own.place + own.origin, limit, EASY_GIVEN * limit, &home, &near_face);
-        passes = square < limit
-            && land_points(&own, points, heads, edge / 3u, back / 3u, count, limit)
-            && fan_lies_near(&own, &surface, homes, home, limit, spacing, square);
+        float farthest;
+        passes = land_points(&own, points, heads, edge / 3u, back / 3u, count, limit, &farthest, &home);
+        if (passes && !(sqrt(farthest) + rise * sqrt(own.slope) < sqrt(limit))) {
+            int near_face = NO_FACE;
+            const float square = square_to_given(
+                &surface, own.place + own.origin, limit, EASY_GIVEN * limit, &home, &near_face);
+            passes = square < limit
+                && fan_lies_near(&own, &surface, homes, home, limit, spacing, square, farthest, rise);
+        }
     }
     if (!passes) {
         octaves[edge] = REFUSED;

@@ -120,6 +120,7 @@ typedef struct {
     __local uint *vertices, *fan, *near, *waiting;
     uint size, split;
     float3 origin, u, w, place, normal;
+    float slope; /* largest square of the tangent between the normal and that of a face */
 } patch;
 
 static inline uint ring_after(const patch *own, const uint i) { return i + 1u == own->size ? 0u : i + 1u; }
@@ -200,9 +201,11 @@ static inline int place_vertex(patch *own, const quadric sum)
 }
 
 /* False where a face would turn over, or be a line. */
-static inline int keeps_normals(const patch *own)
+static inline int keeps_normals(patch *own)
 {
     int keeps = 1;
+    const float normal = dot3(own->normal, own->normal);
+    own->slope = 0.0f;
     for (uint i = 0; keeps && i < own->size; ++i) {
         const float3 from = end_of_edge(own, i);
         const float3 one = ring_place(own, i), two = ring_place(own, i + 1u);
@@ -211,6 +214,8 @@ static inline int keeps_normals(const patch *own)
         const float length = max(max(dot3(p, p), dot3(q, q)), dot3(r, r)), square = dot3(now, now);
         const float length_before = max(max(dot3(s, s), dot3(t, t)), dot3(r, r)), square_before = dot3(before, before);
         const float along = dot3(before, now);
+        const float upward = max(dot3(now, own->normal), 0.0f), cosine = upward * upward;
+        own->slope = max(own->slope, (normal * square - cosine) / cosine);
         const int had_normal = square_before > SLENDER * length_before * length_before;
         const int turns_little = along > 0.0f && along * along > STEEPEST * STEEPEST * square * square_before;
         keeps = square > SLENDER * SLENDER * length * length
@@ -267,17 +272,20 @@ static inline uint list_face(const patch *own, const uint i, const uint above, c
 }
 
 /* Find a face of the fan for each point of the lists; false where one lies farther away than the limit from all.  (A point
- * of each list in turn: their loads do not wait for each other.) */
+ * of each list in turn: their loads do not wait for each other.)  farthest: square of the largest of their distances;
+ * home: the given vertex among them that is nearest to the new place. */
 static inline int land_points(
     const patch *own, __global float4 *points, __global const uint *heads, const uint above,
-    const uint below, const uint count, const float limit)
+    const uint below, const uint count, const float limit, float *farthest, uint *home)
 {
+    float beside = MAXFLOAT;
     const float3 center = own->origin + own->place;
     for (uint i = 0; i < own->size + 2u; ++i) {
         own->waiting[i] = heads[list_face(own, i, above, below)];
         PREFETCH(points + own->waiting[i]);
     }
     int lands = 1;
+    *farthest = 0.0f;
     for (uint left = own->size + 2u; lands && left > 0;) {
         left = 0;
         for (uint i = 0; lands && i < own->size + 2u; ++i) {
@@ -294,10 +302,16 @@ static inline int land_points(
                 if (!(least <= EASY * limit))
                     look_at_fan(own, away, &least, &nearest);
                 lands = least <= limit;
+                *farthest = max(*farthest, least);
                 if (lands) {
                     points[number].w = as_float(nearest << 28 | following);
-                    if (number < count)
+                    if (number < count) {
                         own->near[nearest] = number;
+                        if (dot3(away, away) < beside) {
+                            beside = dot3(away, away);
+                            *home = number;
+                        }
+                    }
                 }
             }
         }
@@ -368,10 +382,21 @@ static inline uint nearer(const target *to, const float3 point, const uint one, 
     return dot3(away, away) <= dot3(other, other) ? one : two;
 }
 
-/* True where points of the new edges and faces lie near the given surface. */
+/* True where the points of a new edge and its faces are as near to the given surface as the points of that one, which
+ * are at most `farthest` (its square) away from them, show: between two of these a ridge rises `rise` at 90 degrees. */
+static inline int is_flat(const patch *own, const uint i, const float farthest, const float rise, const float limit)
+{
+    const float3 way = ring_place(own, i);
+    const float3 one = cross3(ring_place(own, i == 0u ? own->size - 1u : i - 1u), way);
+    const float3 other = cross3(way, ring_place(own, i + 1u));
+    const float cosine = dot3(one, other) / sqrt(dot3(one, one) * dot3(other, other));
+    return sqrt(farthest) + rise * sqrt(max(1.0f - cosine, 0.0f) / (1.0f + cosine)) < sqrt(limit);
+}
+
+/* True where points of the new edges and faces lie near the given surface; those of flat ones are not looked at. */
 static inline int fan_lies_near(
     const patch *own, const target *to, __global const uint *homes, const uint home, const float limit,
-    const float step, const float square)
+    const float step, const float square, const float farthest, const float rise)
 {
     uint last = own->near[own->size - 1u], side = homes[own->vertices[0]];
     int is_near = 1;
@@ -380,15 +405,16 @@ static inline int fan_lies_near(
         const float3 way = ring_place(own, i), other_way = ring_place(own, after);
         const float length = sqrt(dot3(way, way));
         int near_face = NO_FACE;
+        const int flat = is_flat(own, i, farthest, rise, limit);
         float along = max(OMEGA * (sqrt(limit) - sqrt(square)), step);
-        while (is_near && along < length) {
+        while (is_near && !flat && along < length) {
             const float3 point = own->origin + own->place + way * (along * (1.0f / length));
             uint at = nearer(to, point, nearer(to, point, near, last), nearer(to, point, home, side));
             const float here = square_to_given(to, point, limit, EASY_GIVEN * limit, &at, &near_face);
             is_near = here < limit;
             along += max(OMEGA * (sqrt(limit) - sqrt(here)), step);
         }
-        if (is_near) {
+        if (is_near && !flat) {
             const float3 middle = own->origin + own->place + (way + other_way) * (1.0f / 3.0f);
             uint at = nearer(to, middle, near, nearer(to, middle, home, nearer(to, middle, side, other)));
             is_near = square_to_given(to, middle, limit, limit, &at, &near_face) < limit;

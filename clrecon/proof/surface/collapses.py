@@ -47,12 +47,14 @@ class Verdict(NamedTuple):
     """What is right for a collapse: it passes unless a walk misses the near face, or it may pass, or it must not.
 
     position, ring: ndarray, shapes (3,) and (n, 3), mm. The vertex that stays, and its neighbours.
+    looked_at: ndarray, shape (1 + n,), bool. Whether the position and the middles of the new faces are measured.
     """
 
     should_pass: bool
     may_pass: bool
     position: Float64Array
     ring: Float64Array
+    looked_at: NDArray[np.bool_]
 
 
 def find_surroundings(triangles: NDArray[np.uint32], fans: list[list[int]], u: int, w: int) -> Surroundings | None:
@@ -93,6 +95,7 @@ class FirstRound:
 
     limit_mm: Largest distance of points.
     longest_mm: Edges that are longer have a point in their middle.
+    rise_mm: Height of a ridge of 90 degrees between points that do not show it, see `is_flat` in cl/surface/collapse.h.
     distance: Of points (k, 3) from the surface, mm.
     """
 
@@ -102,10 +105,12 @@ class FirstRound:
         triangles: NDArray[np.uint32],
         limit_mm: float,
         longest_mm: float,
+        rise_mm: float,
         distance: Callable[[Float64Array], Float64Array],
     ):
         self._vertices, self._triangles = vertices, triangles
         self._limit, self._longest = limit_mm, longest_mm
+        self._rise = rise_mm
         self._fans: list[list[int]] = [[] for _ in vertices]
         for row, corners in enumerate(triangles.tolist()):
             for corner in corners:
@@ -119,11 +124,11 @@ class FirstRound:
         points = [np.zeros((0, 3)) if verdict is None else self._find_samples(verdict) for verdict in verdicts]
         distances = np.split(self._distance(np.concatenate(points)), np.cumsum([len(rows) for rows in points])[:-1])
         return [
-            Verdict(False, False, np.zeros(3), np.zeros((0, 3)))
+            Verdict(False, False, np.zeros(3), np.zeros((0, 3)), np.zeros(1, bool))
             if verdict is None
             else verdict._replace(
                 should_pass=verdict.should_pass and float(away.max()) < (1.0 - _UNSURE) * self._limit,
-                may_pass=float(away[: 1 + len(verdict.ring)].max()) < (1.0 + _UNSURE) * self._limit,
+                may_pass=not (away[: len(verdict.looked_at)] > (1.0 + _UNSURE) * self._limit)[verdict.looked_at].any(),
             )
             for verdict, away in zip(verdicts, distances, strict=True)
         ]
@@ -139,7 +144,19 @@ class FirstRound:
         landed = self._land(np.stack(list(self._find_points(u, w))), position, ring)
         if turns < 1.0 - _UNSURE or landed > (1.0 + _UNSURE) * self._limit:
             return None
-        return Verdict(turns > 1.0 + _UNSURE and landed < (1.0 - _UNSURE) * self._limit, True, position, ring)
+        passes = turns > 1.0 + _UNSURE and landed < (1.0 - _UNSURE) * self._limit
+        return Verdict(passes, True, position, ring, self._find_looked_at(position, ring, normal, landed))
+
+    def _find_looked_at(
+        self, position: Float64Array, ring: Float64Array, normal: Float64Array, landed: float
+    ) -> NDArray[np.bool_]:
+        """Mark the position and the faces that are too steep for the points of the given surface to show them."""
+        faces = np.cross(ring - position, np.roll(ring, -1, axis=0) - position)
+        faces /= np.linalg.norm(faces, axis=1, keepdims=True)
+        lean = np.arccos(np.clip(faces @ normal / np.linalg.norm(normal), 0.0, 1.0)).max()
+        bend = np.arccos(np.clip(np.einsum("ka,ka->k", faces, np.roll(faces, 1, axis=0)), -1.0, 1.0))
+        rises = np.tan(np.append(lean, np.minimum(lean, 0.5 * bend)))
+        return landed + self._rise * rises > (1.0 + _UNSURE) * self._limit
 
     @staticmethod
     def _find_samples(verdict: Verdict) -> Float64Array:

@@ -12,7 +12,7 @@ from clrecon.mesh.connectivity import find_edges
 from clrecon.mesh.refine.collapse import FAR, REFUSED, History, Surface, collapse_in_rounds
 from clrecon.mesh.refine.smoothing import Filter, Rings, sinc_terms
 from clrecon.opencl import Device, kernel_number
-from clrecon.operators.surface.collapse import LONG, DeviceCollapser
+from clrecon.operators.surface.collapse import LONG, RISE, DeviceCollapser
 from clrecon.operators.surface.decimation import mark_crossings, plan_crossings
 from clrecon.operators.surface.smoothing import DeviceFilter
 from clrecon.proof.checking import Check, require_close, require_equal
@@ -133,7 +133,8 @@ def _check_verdicts(places: NDArray[np.float32], given: Surface, history: Histor
     """Compare which selected edges collapse, and to which places, with the twin; return the largest difference, mm."""
     vertices, triangles = places.astype(np.float64), given.triangles
     distance = SurfaceDistance(vertices, triangles)
-    first_round = FirstRound(vertices, triangles, _TIGHT_MM, math.sqrt(LONG) * given.mean_edge, distance)
+    longest, rise = math.sqrt(LONG) * given.mean_edge, RISE * given.mean_edge
+    first_round = FirstRound(vertices, triangles, _TIGHT_MM, longest, rise, distance)
     pairs = ends.T[:: max(1, ends.shape[1] // _JUDGED)].tolist()
     apart = [0.0]
     missed = passed = 0
