@@ -377,6 +377,20 @@ class InputSettings(ScanSettings, DeviceSettings):
         return str(getattr(self, "space", "lps"))
 
 
+@dataclass(frozen=True, kw_only=True)
+class SharedSettings(InputSettings):
+    """Settings of jobs whose work can be shared out to all devices of this machine."""
+
+    @property
+    def uses_all_devices(self) -> bool:
+        return self.device == ALL_DEVICES
+
+    @property
+    def main_device(self) -> str | None:
+        """The device of all that is not shared out."""
+        return None if self.uses_all_devices else self.device
+
+
 _REGION_NUMBERS = {"box": 6, "hu": 2, "seed": 3, "tube": 1}
 
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextvars import copy_context
+from queue import SimpleQueue
 from typing import Any, TypeVar
 
 import numpy as np
@@ -64,6 +67,43 @@ def side_by_side(in_pool: Callable[[], _One], on_this_thread: Callable[[], _Othe
         first = pool.submit(in_pool)
         second = on_this_thread()
         return first.result(), second
+
+
+_AHEAD = 2
+"""Results of each worker that may wait for their turn, which bounds the memory."""
+
+
+def deal_in_order(workers: Sequence[Callable[[_One], _Other]], items: Iterable[_One]) -> Generator[_Other, None, None]:
+    """Yield the result of each item, in order, from workers that take one item after another, each in a thread.
+
+    One worker works in the thread of the caller.  An error is raised in its turn; items that no worker has begun with
+    are then left, as they are when the iterator is closed.
+    """
+    if len(workers) == 1:
+        yield from map(workers[0], items)
+        return
+    idle: SimpleQueue[Callable[[_One], _Other]] = SimpleQueue()
+    for worker in workers:
+        idle.put(worker)
+
+    def work_on(item: _One) -> _Other:
+        worker = idle.get()
+        try:
+            return worker(item)
+        finally:
+            idle.put(worker)
+
+    with ThreadPoolExecutor(len(workers), thread_name_prefix="dealt") as pool:
+        waiting: deque[Future[_Other]] = deque()
+        try:
+            for item in items:
+                waiting.append(pool.submit(copy_context().run, work_on, item))
+                if len(waiting) > _AHEAD * len(workers):
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
 
 
 def spread_rows(count: int, most: int) -> NDArray[np.int64]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from clrecon.system import pieces
-from clrecon.system.pieces import list_distinct, side_by_side, sort_with_rows
+from clrecon.system.pieces import deal_in_order, list_distinct, side_by_side, sort_with_rows
 
 pytestmark = pytest.mark.unit
 
@@ -80,3 +80,34 @@ def test_an_error_in_one_piece_is_raised_by_the_whole(monkeypatch, threads):
 
     with pytest.raises(ValueError, match="this piece"):
         pieces.in_threads(fail_late, 1000, size=64)
+
+
+def test_results_of_dealt_items_come_in_their_order_although_a_later_one_is_ready_first() -> None:
+    later_is_ready = threading.Event()
+
+    def work(item: int) -> int:
+        if item == 0:
+            assert later_is_ready.wait(10)
+        if item == 1:
+            later_is_ready.set()
+        return -item
+
+    assert list(deal_in_order([work, work], range(5))) == [0, -1, -2, -3, -4]
+
+
+def test_workers_get_no_more_items_than_may_wait_for_their_turn() -> None:
+    begun: list[int] = []
+    results = deal_in_order([begun.append, begun.append], range(100))
+    next(results)
+    assert len(begun) <= 2 * 2 + 1  # two of each of two workers wait, and one was taken
+    results.close()
+
+
+def test_error_of_a_dealt_item_is_raised_in_its_turn() -> None:
+    def work(item: int) -> int:
+        return 6 // item
+
+    results = deal_in_order([work, work], [3, 2, 0, 1])
+    assert [next(results), next(results)] == [2, 3]
+    with pytest.raises(ZeroDivisionError):
+        next(results)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from clrecon.errors import UsageError
 from clrecon.exchange.formats import check_assembly, check_in_pieces, describe_rounding
 from clrecon.geometry import frame_from_lps
+from clrecon.jobs.devices import list_usable
 from clrecon.jobs.mesh.bone import judge_surfaces, warn_of_walls
 from clrecon.jobs.mesh.labels import describe_label, judge_label_volumes, name_label_files
 from clrecon.jobs.mesh.make import MadeParts, first_names, label_parts, make_parts, warn_of_crumbs
@@ -368,11 +369,12 @@ class _PassingMeshes:
 
         from clrecon.mesh import Mesh
         from clrecon.mesh.written_parts import PartsFile
-        from clrecon.operators.surface.spans import PassingSurface
+        from clrecon.operators.surface.spans import DeviceSpans, PassingSurface
 
         run, settings = self._run, self._run.settings
+        spans = DeviceSpans(list_usable(), settings.memory) if settings.uses_all_devices else None
         passing = PassingSurface(
-            resident, surface.iso_value, closed=settings.closed, topology=settings.topology, below=surface.below,
+            resident, surface.iso_value, spans, closed=settings.closed, topology=settings.topology, below=surface.below,
             vertex_rule=settings.vertex_rule, progress=run.progress,
         )  # fmt: skip
 

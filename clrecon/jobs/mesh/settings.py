@@ -117,7 +117,7 @@ _refinement_option = partial(option, group="refinement")
 
 
 @dataclass(frozen=True)
-class MeshSettings(options.InputSettings):
+class MeshSettings(options.SharedSettings):
     """Settings of the mesh job; options say in their help what they do.
 
     iso_value: float or sequence of float or (low, high). A pair in the sequence is a range: ``((100, 300),)``.
@@ -306,8 +306,7 @@ class MeshSettings(options.InputSettings):
     def _check_by_slabs(self) -> None:
         asked = name_parameter("by_slabs", True)
         options.refuse_changed(self, _OF_WHOLE_MESHES, f"{asked} keeps no mesh in memory, which this needs")
-        if self.is_shared_out:
-            raise UsageError(f"{asked} takes one device: {options.describe_sharing(self.scheduler)}")
+        options.refuse_changed(self, ("scheduler",), f"{asked} writes what devices of this machine make")
 
     def _check_surface(self) -> None:
         """Refuse an unknown kind of surface, and `cortex` where HU do not place the outer surface of bone."""
@@ -458,12 +457,7 @@ class MeshSettings(options.InputSettings):
     @property
     def is_shared_out(self) -> bool:
         """True where spans of slices go to several devices, or to workers."""
-        return self.scheduler is not None or self.device == options.ALL_DEVICES
-
-    @property
-    def main_device(self) -> str | None:
-        """The device of all that is not shared out."""
-        return None if self.device == options.ALL_DEVICES else self.device
+        return self.scheduler is not None or self.uses_all_devices
 
     @property
     def levels(self) -> tuple[float | tuple[float, ...], ...]:

@@ -11,7 +11,6 @@ from clrecon.geometry import Volume
 from clrecon.jobs.cluster import Cluster, Died, open_cluster
 from clrecon.jobs.devices import list_usable
 from clrecon.jobs.mesh.settings import MeshSettings
-from clrecon.jobs.options import ALL_DEVICES
 from clrecon.mesh import Mesh
 from clrecon.opencl import Device
 from clrecon.operators import choose_device
@@ -49,7 +48,7 @@ def extract_shared_out(
 @contextmanager
 def _open_makers(volume: Volume, settings: MeshSettings, progress: Progress) -> Iterator[tuple[Any, int]]:
     """Yield what makes spans, and how many of them to cut."""
-    devices = list_usable() if settings.device == ALL_DEVICES else None
+    devices = list_usable() if settings.uses_all_devices else None
     if settings.scheduler is None:
         assert devices is not None
         spans = DeviceSpans(devices, settings.memory)

@@ -16,6 +16,7 @@ from clrecon.anatomy.head import SKIN_SEEN_HU, warn_of_face
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.certificate import amend
+from clrecon.jobs.devices import list_usable
 from clrecon.jobs.inputs import describe_cloud, is_cloud_file, is_only_mesh, read_with_labels, refuse_scan_settings
 from clrecon.jobs.outputs import check_distinct, check_files, check_kept
 from clrecon.jobs.preprocess import Band, mask_volume, preprocess_volume, restrict_volume
@@ -172,9 +173,10 @@ def report_of(
     colored = style if isinstance(style, SurfaceLook | PointLook | MeshLook) else None
     return run.report(
         PictureReport,
-        [*device.warnings, *taker.warnings, *face],
+        [*chain(*(own.current.warnings for own in taker.devices)), *taker.warnings, *face],
         volume,
         on=device,
+        **_name_devices(taker) if settings.uses_all_devices else {},
         before=list(chain(*(file.get("warnings", ()) for file in files))),
         affine_ijk_to_lps_mm=subject.report.get("affine_ijk_to_lps_mm") if volume is None else volume.affine.tolist(),
         mode=style.mode,
@@ -198,6 +200,14 @@ def report_of(
         pictures=list(pictures),
         turntable=turntable,
     )
+
+
+def _name_devices(taker: PictureTaker) -> dict[str, str]:
+    devices = [device.current for device in taker.devices]
+    return {
+        "device": " and ".join(device.label for device in devices),
+        "driver": " and ".join(device.driver for device in devices),
+    }
 
 
 def _describe_meshes(
@@ -290,12 +300,25 @@ def make_pictures(
             run.lap("mask")
         beside = Beside(function, curve, labels, meshes)
         with PictureTaker(subject, device, settings, run.progress, beside) as taker:
+            if settings.uses_all_devices:
+                taker.share_with([other for other in list_usable() if other.index != device.current.index])
+                taker.warnings += _warn_of_platforms(taker.devices)
             pictures = [] if files.picture is None else _take_views(run, taker, files)
             turntable = _take_turntable(run, taker, files)
             report = report_of(run, subject, taker, device.current, pictures, turntable)
             run.finish(report, files.report)
     log.info("%d files of pictures made on %s in %.3f s", len(run.files), report.device, run.total())
     return report
+
+
+def _warn_of_platforms(devices: Sequence[Device]) -> list[str]:
+    platforms = list(dict.fromkeys(device.platform for device in devices))
+    if len(platforms) == 1:
+        return []
+    return [
+        f"devices of {' and '.join(platforms)} take pictures in turn: their volume renderings and means can differ by a"
+        " grey level or two in single pixels"
+    ]
 
 
 _OTHER_INPUTS = ("mesh", "points")
@@ -378,14 +401,16 @@ def _take_views(run: Run, taker: PictureTaker, files: PictureFiles) -> list[dict
     """Take the picture of each view and write it under a temporary name; return the report's entries of them."""
     pictures: list[dict[str, Any]] = []
     views = taker.views
-    for number, view in enumerate(views):
-        run.progress("render", number, len(views) if len(views) > 1 else 0)
-        picture = taker.take_view(view)
+    total = len(views) if len(views) > 1 else 0
+    run.progress("render", 0, total)
+    for number, (view, picture) in enumerate(zip(views, taker.take_views(), strict=True), start=1):
         run.lap("render")
         name = name_view(view, views)
         pictures.append(describe_picture(picture, name, view) | _write_picture(run, picture, files, name))
-        taker.warnings += warn_of_picture(picture, taker.device.warnings)
+        taker.warnings += warn_of_picture(picture, [*chain(*(device.warnings for device in taker.devices))])
         run.lap("write")
+        if number < total:
+            run.progress("render", number, total)
     return pictures
 
 
@@ -402,8 +427,7 @@ def _take_turntable(run: Run, taker: PictureTaker, files: PictureFiles) -> dict[
 
     def frames() -> Iterator[Rendering]:
         nonlocal empty
-        for camera in cameras:
-            picture = taker.take(camera)
+        for picture in taker.take_all(cameras):
             why = None if empty is None else find_emptiness(picture)
             empty = None if empty is None or why is None else [*empty, why]
             yield picture

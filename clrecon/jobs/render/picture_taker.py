@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any, cast
 
@@ -22,7 +22,8 @@ from clrecon.rendering.views.clip import check_center
 from clrecon.rendering.views.directions import default_view, read_view, say_view
 from clrecon.system.base_classes import Closing
 from clrecon.system.light_dataclass import dataclass
-from clrecon.system.progress import Progress
+from clrecon.system.pieces import deal_in_order
+from clrecon.system.progress import Progress, ignore_progress
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
@@ -89,8 +90,9 @@ class PictureTaker(Closing):
         beside = beside or Beside()
         self.meshes = list(beside.meshes)
         self._subject, self.device = subject, device
-        self._settings = settings
+        self._settings, self._beside = settings, beside
         self.labels, self._progress = beside.labels, progress
+        self._takers = [self]
         self.style = settings.style_with(beside.function, beside.curve, beside.labels)
         self.function = beside.function or _shown_function(settings, self.style)
         self.warnings: list[str] = []
@@ -100,6 +102,17 @@ class PictureTaker(Closing):
 
     def close(self) -> None:
         self._stack.close()
+
+    def share_with(self, devices: Sequence[Device]) -> None:
+        """Let other devices take pictures beside this one, each with the subject in its own memory."""
+        for device in devices:
+            taker = PictureTaker(self._subject, device, self._settings, ignore_progress, self._beside)
+            self._takers.append(self._stack.enter_context(taker))
+
+    @property
+    def devices(self) -> list[Device]:
+        """The devices that take pictures, this one's first."""
+        return [taker.device for taker in self._takers]
 
     @property
     def views(self) -> tuple[str, ...]:
@@ -130,6 +143,17 @@ class PictureTaker(Closing):
     def lighting(self) -> Lighting | None:
         shaded = VolumeLook | SurfaceLook | PointLook | MeshLook
         return self.style.light if isinstance(self.style, shaded) else None
+
+    def take_views(self) -> Iterator[Rendering]:
+        """Yield the picture of each of `views`, in their order."""
+        if len(self._takers) > 1 and not isinstance(self.style, CurveCut):
+            for taker in self._takers:
+                taker._box = self.box  # found once
+        yield from deal_in_order([taker.take_view for taker in self._takers], self.views)
+
+    def take_all(self, cameras: Sequence[Camera]) -> Iterator[Rendering]:
+        """Yield the picture of each camera, in their order."""
+        yield from deal_in_order([taker.take for taker in self._takers], cameras)
 
     def take_view(self, view: str) -> Rendering:
         settings = self._settings

@@ -16,7 +16,7 @@ from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.blocks import CROPS, Box, crop_box
 from clrecon.geometry.grid import Grid
 from clrecon.jobs.options import (
-    InputSettings,
+    SharedSettings,
     label_color_option,
     label_map_option,
     mesh_space_option,
@@ -161,7 +161,7 @@ def color_apart(meshes: Sequence[MeshFile]) -> list[MeshFile]:
 
 
 @dataclass(frozen=True)
-class RenderSettings(InputSettings):
+class RenderSettings(SharedSettings):
     """Settings of the render job, which makes pictures from a CT series; options say in their help what they do.
 
     style: What the pictures show.  The files below add to it, see `style_with`.

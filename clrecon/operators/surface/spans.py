@@ -7,10 +7,8 @@ after its own, as the next span does from 0: an index of the whole is that of th
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from contextlib import suppress
-from contextvars import copy_context
-from queue import Empty, SimpleQueue
+from contextlib import ExitStack, closing
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,7 +25,7 @@ from clrecon.operators.surface.extraction import Extraction, Part, SpanPart, cho
 from clrecon.operators.surface.marching_cubes import too_many
 from clrecon.operators.surface.slabs import SampleGrid, Slab
 from clrecon.system.memory import unreserved_zeros
-from clrecon.system.pieces import find_bounds
+from clrecon.system.pieces import deal_in_order, find_bounds
 from clrecon.system.progress import Progress, ignore_progress
 
 Span = tuple[int, int]
@@ -79,12 +77,22 @@ class PassingSurface:
     """A surface that is made a span at a time and never whole: counted first, so that its size is known.
 
     level, how: As for `extract_by_spans`.  The volume is read twice.
+    make_spans: Yields the spans in their order; None: the device of the volume makes them.
     vertices, triangles: Their numbers in all spans.
     bounds: (2, 3). Lowest and highest corner of what was made so far, LPS mm.
     """
 
-    def __init__(self, resident: DeviceVolume, level: Any, *, progress: Progress = ignore_progress, **how: Any):
+    def __init__(
+        self,
+        resident: DeviceVolume,
+        level: Any,
+        make_spans: MakeSpans | None = None,
+        *,
+        progress: Progress = ignore_progress,
+        **how: Any,
+    ):
         self._resident, self._grid = resident, choose_grid(resident, level, **how)
+        self._make_spans = make_spans or self._make_in_turn
         self._run = Extraction(resident, self._grid, [])
         if self._run.placement.origin is not None:
             raise UsageError(
@@ -115,13 +123,18 @@ class PassingSurface:
                 self._run.take_facts(run.facts()._replace(slabs=0))
         return counts
 
+    def _make_in_turn(self, grid: SampleGrid, spans: Sequence[Span]) -> Iterator[tuple[Span, SpanPart]]:
+        for span in spans:
+            for attempt in self._resident.with_fallback():
+                with attempt as (_, warnings):
+                    span_part = make_span(self._resident, grid, span, warnings)
+            yield span, span_part
+            del span_part
+
     def parts(self, progress: Progress = ignore_progress) -> Iterator[Part]:
         """Yield positions, normals and triangles of each span, whose indices are those of the whole; once."""
         progress("slabs", 0, self._grid.shape[2])
-        for span in self._spans:
-            for attempt in self._resident.with_fallback():
-                with attempt as (_, warnings):
-                    span_part = make_span(self._resident, self._grid, span, warnings)
+        for span, span_part in self._make_spans(self._grid, self._spans):
             part = self._run.take_span(span_part)
             del span_part
             self._widen(part[0])
@@ -170,35 +183,15 @@ class DeviceSpans:
         return _SPANS_A_DEVICE * len(self._devices)
 
     def __call__(self, grid: SampleGrid, spans: Sequence[Span]) -> Iterator[tuple[Span, SpanPart]]:
-        waiting: SimpleQueue[Span] = SimpleQueue()
-        for span in spans[len(self._devices) :]:
-            waiting.put(span)
-        ready: SimpleQueue[tuple[Span, SpanPart]] = SimpleQueue()
-
-        def make_waiting(device: Device, span: Span) -> None:
-            with DeviceVolume(grid.volume, device=device, memory=self._memory) as resident, suppress(Empty):
-                while True:
-                    ready.put((span, make_span(resident, grid, span)))
-                    span = waiting.get_nowait()
-
-        with ThreadPoolExecutor(len(self._devices), thread_name_prefix="spans") as pool:
-            threads: set[Future[None]] = {
-                pool.submit(copy_context().run, make_waiting, device, span)
-                for device, span in zip(self._devices, spans, strict=False)
-            }
-            try:
-                while threads:
-                    ended, threads = wait(threads, timeout=0.05, return_when=FIRST_COMPLETED)
-                    for thread in ended:
-                        thread.result()
-                    while not ready.empty():
-                        yield ready.get()
-                while not ready.empty():
-                    yield ready.get()
-            finally:
-                with suppress(Empty):
-                    while True:
-                        waiting.get_nowait()
+        """Yield the spans in their order."""
+        with ExitStack() as stack:
+            residents = [
+                stack.enter_context(DeviceVolume(grid.volume, device=device, memory=self._memory))
+                for device in self._devices
+            ]
+            makers = [partial(make_span, resident, grid) for resident in residents]
+            with closing(deal_in_order(makers, spans)) as parts:
+                yield from zip(spans, parts, strict=True)
 
 
 class SentSpan(NamedTuple):

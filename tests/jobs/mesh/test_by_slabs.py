@@ -54,6 +54,7 @@ OPTIONS = {
     "open at the border": ["m.ply", "--hu", "0", "--open"],
     "trilinear": ["m.stl", "--hu", "0", "--topology", "trilinear"],
     "solid": ["m.stl", "--hu", "0", "--solid"],
+    "all devices": ["m.ply", "--hu", "0", "--device", "all"],
     "two levels": ["m.stl", "--hu", "0,100"],
 }
 
@@ -142,10 +143,9 @@ def test_step_that_takes_the_mesh_as_a_whole_is_refused(given: dict[str, Any], n
         MeshSettings(by_slabs=True, **given)
 
 
-@pytest.mark.parametrize("how", [{"device": "all"}, {"scheduler": "local"}], ids=["devices", "workers"])
-def test_surface_by_slabs_is_not_shared_out(how: dict[str, str]) -> None:
-    with refused(UsageError, "by_slabs", *how.values()):
-        MeshSettings(by_slabs=True, **how)
+def test_surface_by_slabs_takes_no_workers_of_a_scheduler() -> None:
+    with refused(UsageError, "by_slabs", "scheduler"):
+        MeshSettings(by_slabs=True, scheduler="local")
 
 
 def test_format_that_needs_the_whole_mesh_is_refused_before_the_scan_is_read(tmp_path: Path) -> None:
