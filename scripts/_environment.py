@@ -162,17 +162,26 @@ def _make(folder: str, stamp: str, extras: str, compiled: bool, megabytes: int) 
     log = os.path.join(folder, _LOG)
     code = _run_logged(command, log, folder, megabytes)
     if code:
-        raise SetupError("\n".join(["pip failed:", *_last_words(log), f"(its whole output: {log})"]))
+        raise SetupError("\n".join([*_last_words(log), f"(pip's whole output: {log})"]))
     with open(os.path.join(folder, _STAMP + ".new"), "w", encoding="utf-8") as file:
         file.write(stamp)
     os.replace(os.path.join(folder, _STAMP + ".new"), os.path.join(folder, _STAMP))
 
 
 def _last_words(log: str) -> list[str]:
-    """Return the errors in pip's output, else its last lines; a long list of published versions is cut."""
+    """Return why pip failed: no network, else its errors or last lines, where long lists of versions are cut."""
+    import re
+
     with open(log, encoding="utf-8") as file:
-        lines = [line.rstrip()[:200] for line in file if line.strip()]
-    return [line for line in lines if "error:" in line.lower()][-8:] or lines[-8:]
+        lines = [line.rstrip() for line in file if line.strip()]
+    broken = [re.sub(r".*\] |'\).*", "", line) for line in lines if "connection broken by" in line]
+    if broken and any("from versions: none" in line for line in lines):
+        return [
+            f"pip cannot reach the package index: {broken[-1]:.100}.",
+            "The first start needs a network, later ones do not. Behind a proxy set HTTPS_PROXY.",
+        ]
+    errors = [line for line in lines if "error:" in line.lower()]
+    return ["pip failed:", *(line[:200] for line in (errors or lines)[-8:])]
 
 
 def _run_logged(command: list[str], log: str, folder: str, megabytes: int) -> int:

@@ -144,7 +144,7 @@ def _check_apart(device: Device) -> tuple[str, bytes]:
     how = names.get(ended.returncode, f"exit code {ended.returncode}")
     fault = f"its driver ends the process ({how})"
     if _lacks_linker(device):
-        fault += ", because there is no linker ld on the PATH (Debian: apt install binutils libc6-dev libgcc-12-dev)"
+        fault += ", because there is no linker ld on the PATH"
     return fault, _CRASHED + fault.encode()
 
 
@@ -355,10 +355,11 @@ def _take_sound(devices: list[Device]) -> Device:
                 log.warning("%s", text)
                 device.remark(text)
             return device
-        passed_over.append(f"{device.label} is not used, it computes wrongly: {fault}")
-    raise DeviceError(
-        f"{'; '.join(passed_over)}: update its driver or choose another device; `clrecon selftest` tests every kernel"
-    )
+        passed_over.append(f"{device.label} is not used, its check failed: {fault}")
+    remedy = "update its driver or choose another device; `clrecon selftest` tests every kernel"
+    if any(_lacks_linker(device) for device in devices):
+        remedy = "install one (Debian: apt install binutils libc6-dev libgcc-12-dev)"
+    raise DeviceError(f"{'; '.join(passed_over)}: {remedy}")
 
 
 def _is_named(device: Device, name: str | int | None) -> bool:

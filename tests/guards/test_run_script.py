@@ -158,6 +158,28 @@ def test_output_of_an_installation_is_written_to_its_log_alone(tmp_path: Path) -
     assert (tmp_path / "log").read_text().splitlines() == [f"Collecting part {step}" for step in range(3)]
 
 
+RETRYING = (
+    "  WARNING: Retrying (Retry(total=0, connect=None)) after connection broken by 'NewConnectionError('<a.B object at"
+    " 0x7f>: Failed to establish a new connection: [Errno -3] Temporary failure in name resolution')': /simple/numpy/\n"
+)
+NO_VERSION = "  ERROR: Could not find a version that satisfies the requirement numpy (from versions: none)\n"
+
+
+@pytest.mark.parametrize(
+    ("log", "first"),
+    [
+        (RETRYING + NO_VERSION, "pip cannot reach the package index: Temporary failure in name resolution."),
+        (RETRYING + "error: no space left on device\n", "pip failed:"),
+        (NO_VERSION, "pip failed:"),
+    ],
+    ids=["no network", "other error after a retry", "no such version"],
+)
+def test_last_words_of_pip_say_whether_the_network_was_missing(log: str, first: str, tmp_path: Path) -> None:
+    (tmp_path / "log").write_text(log)
+    last_words = runpy.run_path(str(ROOT / "scripts" / "_environment.py"))["_last_words"]
+    assert last_words(str(tmp_path / "log"))[0] == first
+
+
 @posix_only
 def test_hooks_of_commits_run_the_quick_checks_of_the_test_script() -> None:
     """The same programs with the same arguments, which .pre-commit-config.yaml cannot import."""

@@ -210,7 +210,7 @@ def test_device_with_a_remembered_fault_is_no_other_one_in_the_explanation(machi
     assert select.explain_choice() == "no other one"
 
 
-H200_IS_WRONG = "H200 (NVIDIA CUDA) is not used, it computes wrongly: 7 of 9 vertices of a ball lie beside it"
+H200_IS_WRONG = "H200 (NVIDIA CUDA) is not used, its check failed: 7 of 9 vertices of a ball lie beside it"
 
 
 @pytest.fixture
