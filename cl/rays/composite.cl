@@ -15,6 +15,7 @@
  * -D TAKES_PARTS=1      steep segments in parts; steps are so short that values are nearly linear between samples;
  *                       default 0, samples alone
  * -D LABELS             labels with colours and opacities
+ * -D OPENNESS           hollows are darker, see rays/openness.h
  * -D BETWEEN            only what lies between two depths of each pixel, see cl/rays/layers.cl */
 #include "rays/between.h"
 #include "rays/field.h"
@@ -23,6 +24,7 @@
 #include "rays/label_color.h"
 #include "rays/leap.h"
 #include "rays/look_ahead.h"
+#include "rays/openness.h"
 #include "rays/phong.h"
 #include "rays/ray_packet.h"
 #include "rays/ray_state.h"
@@ -155,8 +157,8 @@ static inline floats find_opacity(const field *f, const slice_stack *stack, cons
 /* Blend segment n of each ray where it has opacity; `value` and `opacity` are those at `number`.  Light comes from the
  * gradients of `smooth`. */
 static inline void blend_samples(const field *f, const field *smooth, const slice_stack *stack, const looks *look, const ray_lanes *course,
-    const packet *rays, const float n, const int inner, const floats number, const floats value, floats opacity,
-    sights *seen)
+    const packet *rays, const open_grid *grid, const float n, const int inner, const floats number,
+    const floats value, floats opacity, sights *seen)
 {
     floats i, j, k;
     find_places(stack, course, rays, number, 1, &i, &j, &k);
@@ -176,6 +178,9 @@ static inline void blend_samples(const field *f, const field *smooth, const slic
             find_light(look->view, look->highlights, x, y, z, rays->toward_x, rays->toward_y, rays->toward_z, &share,
                 &highlight);
     }
+    const floats open = find_openness(grid, i, j, k);
+    share *= open;
+    highlight *= open;
     const floats t = rays->t_in + (number + rays->phase) * look->ray_step;
     const ints cut = (rays->last == n) & (opacity > 0.0f);
     if (ANY_LANE(cut))
@@ -303,6 +308,7 @@ static inline void load_sights(__global const float4 *states, const int2 first_p
  *             stage    FIRST_SLAB and LAST_SLAB, see rays/view.h
  *             with BETWEEN nearest, farthest  in  (height, width) mm along the ray where the way begins and ends
  *             with LABELS those of the buffer's slices, and the table of rays/label_color.h
+ *             with OPENNESS the grid of rays/openness.h
  *             with UNEVEN the table of slices, see rays/stack.h
  * Launch      global = tiles * 64 / LANES rounded up by the host, any local
  * Guarantees  every pixel of image, depths and means is written with the last slab */
@@ -321,11 +327,12 @@ __kernel void composite_rays(
     const float steps_per_unit, const uint width, const uint height, const uint planes, const int perspective,
     const int shaded, const int jitter, const int stage, const uint queues, const int main_axis, const int ahead,
     const float4 eye, const float aside
-    BETWEEN_PARAMETERS LABEL_PARAMETERS STACK_PARAMETERS)
+    BETWEEN_PARAMETERS LABEL_PARAMETERS OPENNESS_PARAMETERS STACK_PARAMETERS)
 {
     const uint first_pixel = (uint)get_global_id(0) * LANES;
     const field f = { voxels, ni, nj, first_k, end_k, last_place };
     const field smooth = { smoothed, ni, nj, first_k, end_k, last_place };
+    const open_grid grid = OPENNESS_GRID;
     const leap_map map = { ways, bi, bj, bk, cells_k };
     const main_way way = { main_axis, ahead, eye, aside };
     const slice_stack stack = STACK_TABLE;
@@ -408,8 +415,8 @@ __kernel void composite_rays(
                         &f, &stack, &look, &course, &rays, segment, inner, counts, &v, &number, &seen_value);
                     const floats seen_here = choose(counts, opacity, (floats)(0.0f));
                     if (ANY_LANE(seen_here > 0.0f)) {
-                        blend_samples(&f, &smooth, &stack, &look, &course, &rays, segment, inner, number, seen_value, seen_here,
-                            &seen);
+                        blend_samples(&f, &smooth, &stack, &look, &course, &rays, &grid, segment, inner, number, seen_value,
+                            seen_here, &seen);
                         end = choose(seen.opacity < OPAQUE, end, (floats)(0.0f));
                     }
                     for (int next = 1; LANES == 1 && next < AT_ONCE + 2 * BESIDE; ++next)

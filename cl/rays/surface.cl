@@ -8,8 +8,10 @@
  * reached, each continues alone, takes LANES samples along its way at a time and searches the first that is inside.
  *
  * -D UNEVEN   uneven slices
- * -D LABELS   labels with colours and opacities: a ray continues through translucent labels */
+ * -D LABELS   labels with colours and opacities: a ray continues through translucent labels
+ * -D OPENNESS hollows are darker, see rays/openness.h */
 #include "rays/hit.h"
+#include "rays/openness.h"
 #include "rays/ray_state.h"
 #include "rays/surface_lines.h"
 #include "rays/view.h"
@@ -166,15 +168,16 @@ static inline void follow_light(const scene *s, const looks *look, const hit *hi
     find_inside(s, to_light);
 }
 
-/* Blend a hit of colour rgb, of which `light` of the fixed light is lit, over what the ray has seen. */
+/* Blend a hit of colour rgb, of which `light` of the fixed light is lit, over what the ray has seen; `open` of all
+ * light reaches it. */
 static inline void add_hit(
     const looks *look, const hit *h, const ray *r, const line *along, float3 rgb, const float opacity,
-    const float light, ray_state *seen)
+    const float light, const float open, ray_state *seen)
 {
     const float t = r->t_in + min(h->number, along->last) * look->ray_step;
     const float3 dark = rgb * look->view[VIEW_PHONG].x;
     rgb = dark + light * (shade(look->view, look->highlights, rgb, h->gradient, r->direction) - dark);
-    rgb *= 1.0f - look->cue.z * clamp((t + r->offset - look->cue.x) * look->cue.y, 0.0f, 1.0f);
+    rgb *= open * (1.0f - look->cue.z * clamp((t + r->offset - look->cue.x) * look->cue.y, 0.0f, 1.0f));
     const float weight = (1.0f - seen->color.w) * opacity;
     seen->color.xyz += weight * rgb;
     seen->color.w += weight;
@@ -294,6 +297,7 @@ static inline hit_look find_look(
  *             cue      x: depth that is at full brightness, mm; y: 1 / mm from there to where it ends;
  *                      z: share of the brightness that is lost there
  *             stage    FIRST_SLAB and LAST_SLAB, see rays/view.h
+ *             with OPENNESS the grid of rays/openness.h
  *             with UNEVEN the table of slices, see rays/stack.h
  * Launch      global = tiles * 64 / LANES rounded up by the host, any local
  * Assumes     the buffer reaches two slices beyond the slab, and steps are one at most; with
@@ -309,7 +313,7 @@ __kernel void trace_surface(
     const int cells_k,
     const float level, const float outside, const float4 color, const float4 light_step, const float4 cue,
     const uint width, const uint height, const uint planes, const int perspective, const int stage,
-    const uint queues LABEL_PARAMETERS STACK_PARAMETERS)
+    const uint queues LABEL_PARAMETERS OPENNESS_PARAMETERS STACK_PARAMETERS)
 {
     const uint first_pixel = (uint)get_global_id(0) * LANES;
     const field inner = { voxels, ni, nj, first_k, end_k, last_place };
@@ -318,6 +322,7 @@ __kernel void trace_surface(
     const slice_stack stack = STACK_TABLE;
     const scene s = { f, map, stack, slope };
     const label_source source = LABEL_SOURCE;
+    const open_grid grid = OPENNESS_GRID;
     const looks look = { view, normals, highlights, planes, perspective, color, light_step, cue, view[VIEW_NEAR].y };
     ray rays[LANES];
     bundle all, to_light;
@@ -366,7 +371,9 @@ __kernel void trace_surface(
                 const float blocked = light_step.w > 0.0f ? to_light.numbers[lane] : 0.0f;
                 const hit_look seen = find_look(&s, &source, &look, all.ends[lane] >= 0.0f, to_light.lines + lane,
                     blocked, end, hits + lane, sights + lane);
-                add_hit(&look, hits + lane, rays + lane, all.lines + lane, seen.rgb, seen.opacity, seen.light,
+                const float3 at = index_of(&s, hits[lane].place);
+                const float open = read_openness(&grid, (float4)(at, 0.0f));
+                add_hit(&look, hits + lane, rays + lane, all.lines + lane, seen.rgb, seen.opacity, seen.light, open,
                     sights + lane);
                 all.numbers[lane] += 1.0f;
             }

@@ -148,6 +148,13 @@ class Looks:
         "--depth-cue SHARE", "share of its brightness that a surface loses from its nearest to its farthest point"
     )
     shadows: bool = option("--shadows", "draw shadows on a surface; needs a light away from the camera")
+    ambient_occlusion: float | None = option(
+        "--ambient-occlusion SHARE",
+        "darken hollows of volume rendering and surfaces by up to this share of the light (1 without a number;"
+        " default: 0)",
+        nargs="?",
+        const=1.0,
+    )
     jitter: bool = option("--jitter", "start each ray at an offset of its own: grain instead of rings")
     smooth_light: float | None = option(
         "--smooth-light MM",

@@ -66,14 +66,20 @@ def draw_beside_vtk(renderer: clrecon.VolumeRenderer) -> np.ndarray:
     return np.hstack([ours, theirs])
 
 
-def draw_chest(folder: str) -> np.ndarray:
+def draw_chest(renderer: clrecon.VolumeRenderer) -> np.ndarray:
     """Draw spine and ribs from the front and from behind, in one picture; (h, w, 3) uint8."""
-    volume = clrecon.read_volume(folder)
-    look = clrecon.VolumeLook("bone", ray_step=0.35 * min(volume.spacing))
-    with clrecon.VolumeRenderer(volume) as renderer:
-        front = renderer.render(look, view=(25, 10), size=(520, 620), zoom=1.12)
-        behind = renderer.render(look, view=(150, 12), size=(480, 620), zoom=1.12)
+    look = clrecon.VolumeLook("bone", ray_step=0.35 * min(renderer.volume.spacing))
+    front = renderer.render(look, view=(25, 10), size=(520, 620), zoom=1.12)
+    behind = renderer.render(look, view=(150, 12), size=(480, 620), zoom=1.12)
     return np.hstack([front.image[..., :3], behind.annotated(scale_bar=True).image[..., :3]])
+
+
+def draw_occlusion(renderer: clrecon.VolumeRenderer) -> np.ndarray:
+    """Draw some vertebrae from behind, without and with ambient occlusion; (h, w, 3) uint8."""
+    plain = clrecon.SurfaceLook(225.0)
+    looks = (plain, replace(plain, ambient_occlusion=1.0))
+    pictures = [renderer.render(look, view=(150, 25), size=BESIDE, zoom=4.5).image[..., :3] for look in looks]
+    return np.hstack(pictures)
 
 
 def main() -> None:
@@ -86,8 +92,10 @@ def main() -> None:
     load_pillow()
     from PIL import Image
 
-    chest = Image.fromarray(draw_chest(sys.argv[2]))
-    chest.convert("P", palette=Image.Palette.ADAPTIVE, colors=255).save(folder / "hero.png", optimize=True)
+    with clrecon.VolumeRenderer(clrecon.read_volume(sys.argv[2])) as renderer:
+        for name, draw in (("hero.png", draw_chest), ("render-occlusion.png", draw_occlusion)):
+            chest = Image.fromarray(draw(renderer))
+            chest.convert("P", palette=Image.Palette.ADAPTIVE, colors=255).save(folder / name, optimize=True)
     volume = clrecon.read_volume(sys.argv[1])
     fine = 0.25 * min(volume.spacing)
     with clrecon.VolumeRenderer(volume) as renderer:

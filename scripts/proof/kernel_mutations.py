@@ -131,6 +131,9 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
         )
     },
     "look_ahead": {"ways": (("(uchar)(free << 4 | own[0])", "(uchar)~(free << 4 | own[0])"),)},
+    "fill_cells": {"density": (("? 0.0f : sum /", "? 0.0f : -sum /"),), "open": (("= 0.0f;\n}", "= 0.5f;\n}"),)},
+    "sweep_light": {"open": (("+= weight * (1.0f - hidden);", "-= weight * (1.0f - hidden);"),)},
+    "finish_openness": {"openness": (("= (VOXEL)floor(", "= (VOXEL)-floor("),)},
     "smooth_along": {"smoothed": (("= (VOXEL)value_of[lane];", "= (VOXEL)-value_of[lane];"),)},
     "enter_tiles": {"entries": (("= entry_of[lane];", "= -entry_of[lane];"),)},
     "composite_rays": {

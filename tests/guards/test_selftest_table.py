@@ -75,7 +75,7 @@ def test_every_kernel_and_every_variant_has_a_check() -> None:
 def test_macros_of_variants_are_read_from_the_kernels() -> None:
     assert set().union(*SWITCHES.values()) == {
         "BETWEEN", "BORDER_INSIDE", "CUBIC", "GOLDEN", "GOLDEN_SEARCH", "GRADIENT_OPACITY", "GROWN", "LABELS",
-        "LEAST_VALUE", "MASKS", "RANGE", "TAKES_PARTS", "UNEVEN",
+        "LEAST_VALUE", "MASKS", "OPENNESS", "RANGE", "TAKES_PARTS", "UNEVEN",
     }  # fmt: skip
 
 

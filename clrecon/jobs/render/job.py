@@ -138,6 +138,7 @@ class PictureReport(RunReport):
     depth_cue: float | None
     lighting: Mapping[str, Any] | None
     shadows: bool
+    ambient_occlusion: float
     jitter: bool
     background: Any
     dpi: float | None
@@ -187,6 +188,7 @@ def report_of(
         depth_cue=None if surface is None else surface.depth_cue,
         lighting=None if lighting is None else asdict(lighting),
         shadows=getattr(style, "shadows", False),
+        ambient_occlusion=getattr(style, "ambient_occlusion", 0.0),
         jitter=getattr(style, "jitter", False),
         background=settings.background,
         dpi=settings.dpi,

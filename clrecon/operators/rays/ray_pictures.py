@@ -16,6 +16,7 @@ from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.iso_rule import takes_parts
 from clrecon.opencl import Device, allocate, building_together, kernel_constant, kernel_number, launch, upload
 from clrecon.operators.rays import ray_slabs
+from clrecon.operators.rays.openness import Hiding, OpenCells, Openness, find_openness, hiding_key
 from clrecon.operators.rays.picture_buffers import (
     NEAR_ROW,
     Between,
@@ -251,9 +252,10 @@ def take_with_layers(
     for attempt in resident.with_fallback():
         with attempt as (device, warnings):
             job = _Job(resident, style, shot, ray_step, warnings)
-            planned = ray_slabs.plan_ray_slabs(resident, beside, {}, job.labels, job.smoothing)
+            planned = ray_slabs.plan_ray_slabs(resident, {**beside, **job.beside}, {}, job.labels, job.smoothing)
             for slabs in resident.attempts(ray_slabs.RAYS, planned, job.warnings):
                 with slabs as slices:
+                    job.find_openness(slices)
                     sample = partial(job.sample_between, slices)
                     picture = draw(DrawnVolume(device, sample, job.near_mm, job.stopwatch, job.warnings))
     return picture
@@ -275,9 +277,34 @@ class _Job(ray_slabs.SlabPicture):
             if sigma is None:
                 sigma = resident.keep("smoothing of light", None, 0, lambda: choose_smoothing(resident.volume))
             self.smoothing = ray_slabs.Smoothing.of(resident.volume, sigma)
+        self.openness: Openness | None = None
+        if isinstance(style, VolumeLook) and style.ambient_occlusion > 0.0:
+            cells = OpenCells.of(resident.volume)
+            self.beside = {ray_slabs.OPENNESS: cells.device_bytes(resident.dtype.itemsize)}
+
+    def find_openness(self, slices: int) -> None:
+        """Find the openness of the volume where the style darkens hollows; that of a whole volume is kept."""
+        style, resident = self.style, self.resident
+        if not isinstance(style, VolumeLook) or style.ambient_occlusion == 0.0:
+            return
+        length = OpenCells.of(resident.volume).length_mm
+        look = style.label_style
+
+        def make_openness() -> Openness:
+            tables = TransferTables.of(resident.device, style.function, length)
+            labels = None if look is None else self.labels
+            hiding = Hiding(tables.opacities_d, NODES, tables.low, tables.scale, self.planes, labels, look, grown=True)
+            return find_openness(resident, slices, hiding, self.stopwatch)
+
+        if slices < resident.volume.shape_ijk[2]:
+            self.openness = make_openness()
+            return
+        key = ("dvr", style.function, *hiding_key(self.planes, look))
+        self.openness = resident.keep(ray_slabs.OPENNESS, key, sum(self.beside.values()), make_openness)
 
     def take(self, slices: int) -> Rendering:
         style = self.style
+        self.find_openness(slices)
         (image, depths, means), slabs = self.draw_slabs(slices)
         report = self.describe(style.mode, slabs)
         if isinstance(style, Projection):
@@ -323,6 +350,9 @@ class _Job(ray_slabs.SlabPicture):
             variants |= {"LABELS": "1", **label_variants(self.labels.voxels.dtype)}
             more["labels"] = ray_slabs.slab_labels(resident, slab, self.labels, stopwatch, grown=True)
             more["label_colors"] = upload(device, look.table)
+        if self.openness is not None:
+            variants |= {"OPENNESS": "1"}
+            more |= self.openness.arguments(style.ambient_occlusion)
         if between is not None:
             variants |= {"BETWEEN": "1"}
             more |= {"nearest": between.nearest_d, "farthest": between.farthest_d, "stage": 0}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -54,6 +55,9 @@ RAYS = "rays"
 _BRICKS, _LABELS = "bricks for rays", "labels for rays"
 _SMOOTHED = "smoothed volume"
 """Names of the objects that are kept for a whole volume."""
+
+OPENNESS = "openness of places"
+"""Name of the grid by which hollows are darkened, which is kept too."""
 
 
 @dataclass(frozen=True)
@@ -213,7 +217,7 @@ def plan_ray_slabs(
     if int(resident.device.kernel_variants["LANES"]) > 1:
         most = MOST_VOXELS // (max(2, ni) * max(2, nj))
         most = most if nk <= most else most - overlap
-    slices = resident.plan(RAYS, nk, needs, counted=(_BRICKS, _LABELS, _SMOOTHED), most=most)
+    slices = resident.plan(RAYS, nk, needs, counted=(_BRICKS, _LABELS, _SMOOTHED, OPENNESS), most=most)
     if slices == 0:
         check_budget(resident.device, needs(1), resident.memory)
     return max(slices, 1)
@@ -238,7 +242,7 @@ def ray_slabs(
     for number, (first, end) in enumerate(parts):
         low, high = (-np.inf if first == 0 else first), (np.inf if end == nk else end)
         held_first, held_end = max(first - overlap, 0), min(end + overlap + 1, nk)
-        voxels_d, shape = _upload_part(resident, held_first, held_end, stopwatch)
+        voxels_d, shape = upload_part(resident, held_first, held_end, stopwatch)
         stage = (number == 0) + 2 * (number == len(parts) - 1)
         yield RaySlab(voxels_d, shape, held_first, low, high, cells, stage)
         resident.volume.release_slices(first, end)
@@ -292,9 +296,7 @@ def _whole_slab(resident: DeviceVolume, stopwatch: Stopwatch) -> RaySlab:
     return resident.keep(_BRICKS, None, bricks * (2 * resident.dtype.itemsize + 4), make_slab)
 
 
-def _upload_part(
-    resident: DeviceVolume, first: int, end: int, stopwatch: Stopwatch
-) -> tuple[Any, tuple[int, int, int]]:
+def upload_part(resident: DeviceVolume, first: int, end: int, stopwatch: Stopwatch) -> tuple[Any, tuple[int, int, int]]:
     voxels = resident.volume.voxels[first:end]
     padded = pad_slices(voxels)
     nk, nj, ni = padded.shape
@@ -380,6 +382,8 @@ class SlabPicture(ABC):
 
     makes_image = True
     smoothing: Smoothing | None = None
+    beside: Mapping[str, int] = MappingProxyType({})
+    """Bytes on the device of what is made for the picture beside its slabs."""
 
     def __init__(
         self, resident: DeviceVolume, shot: Shot, ray_step: float, style: LabelStyle | None, warnings: list[str]
@@ -400,7 +404,8 @@ class SlabPicture(ABC):
 
     def run(self) -> Rendering:
         """Take the picture, with thinner slabs if the device has no room for the planned ones."""
-        planned = plan_ray_slabs(self.resident, *PictureBuffers.needs(self.shot.size), self.labels, self.smoothing)
+        others, extra = PictureBuffers.needs(self.shot.size)
+        planned = plan_ray_slabs(self.resident, {**others, **self.beside}, extra, self.labels, self.smoothing)
         for attempt in self.resident.attempts(RAYS, planned, self.warnings):
             with attempt as slices:
                 picture = self.take(slices)

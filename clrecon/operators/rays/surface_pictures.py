@@ -13,8 +13,9 @@ from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule, choose_iso_rule
 from clrecon.labels.label_levels import Growth
 from clrecon.opencl import launch, memory_limits, upload
+from clrecon.operators.rays.openness import Hiding, OpenCells, Openness, find_openness, hiding_key
 from clrecon.operators.rays.picture_buffers import PictureBuffers, RayView, Shot, count_queues, highlight_table
-from clrecon.operators.rays.ray_slabs import LeapMap, RaySlab, SlabPicture, find_leaps, slab_labels
+from clrecon.operators.rays.ray_slabs import OPENNESS, LeapMap, RaySlab, SlabPicture, find_leaps, slab_labels
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.tables import FieldFrame, enclose, label_variants
 from clrecon.rendering import Rendering
@@ -58,6 +59,28 @@ class _Job(SlabPicture):
         self.style = look.label_style
         self.planes = np.empty((0, 4)) if look.clip is None else look.clip.planes
         self.frame = FieldFrame.of(resident.volume)
+        self.openness: Openness | None = None
+        if look.ambient_occlusion > 0.0:
+            self.beside = {OPENNESS: OpenCells.of(resident.volume).device_bytes(resident.dtype.itemsize)}
+
+    def _find_openness(self, slices: int) -> None:
+        """Find the openness of the volume where the style darkens hollows; that of a whole volume is kept."""
+        if self.look.ambient_occlusion == 0.0:
+            return
+        resident, planes = self.resident, self.planes if len(self.planes) else None
+
+        def make_openness() -> Openness:
+            low, scale = _level_nodes(self.rule.iso_level)
+            table_d = upload(resident.device, np.array([0.0, 1.0], np.float32))
+            labels = None if self.style is None else self.labels
+            hiding = Hiding(table_d, 2, low, scale, planes, labels, self.style)
+            return find_openness(resident, slices, hiding, self.stopwatch)
+
+        if slices < resident.volume.shape_ijk[2]:
+            self.openness = make_openness()
+            return
+        key = ("surface", self.rule.iso_level, *hiding_key(planes, self.style))
+        self.openness = resident.keep(OPENNESS, key, sum(self.beside.values()), make_openness)
 
     def take(self, slices: int) -> Rendering:
         resident, nk = self.resident, self.resident.volume.shape_ijk[2]
@@ -69,6 +92,7 @@ class _Job(SlabPicture):
                     f" {limits.describe()}; give more memory or leave the shadows out"
                 )
             self._shorten_steps()
+        self._find_openness(slices)
         pixels, slabs = self.draw_slabs(slices)
         report = self.describe("surface", slabs, iso_value_hu=self.rule.iso_value)
         return Rendering(*pixels, self.shot.camera, None, "surface", report)
@@ -120,6 +144,9 @@ class _Job(SlabPicture):
                 "near": upload(device, near),
                 "offsets": len(near),
             }
+        if self.openness is not None:
+            variants |= {"OPENNESS": "1"}
+            tables |= self.openness.arguments(self.look.ambient_occlusion)
         return variants, tables
 
     def _view(self, leaps: LeapMap) -> RayView:
@@ -164,13 +191,18 @@ def _float4(*numbers: float) -> NDArray[np.float32]:
 
 
 def _find_leaps(resident: DeviceVolume, slab: RaySlab, level: float) -> LeapMap:
-    """Find the bricks that reach the level.
+    """Find the bricks that reach the level."""
+    return find_leaps(resident, slab, ("surface", level), np.array([False, True]), *_level_nodes(level))
 
-    The table has two nodes, and the second is visible.  A value is nearest to it from half a `unit` above `low` on,
-    which is the level.  Marking subtracts a hundredth of a unit, far more than the errors of float32.
+
+def _level_nodes(level: float) -> tuple[float, float]:
+    """Return `low` and `scale` of a table of two nodes, whose second is visible.
+
+    A value is nearest to it from half a unit above `low` on, which is the level.  Marking subtracts a hundredth of a
+    unit, far more than the errors of float32.
     """
     unit = max(1e-3 * abs(level), 1e-6)
-    return find_leaps(resident, slab, ("surface", level), np.array([False, True]), level - 0.5 * unit, 1.0 / unit)
+    return level - 0.5 * unit, 1.0 / unit
 
 
 def _field_heights(volume: Volume, frame: FieldFrame, ks: Sequence[float]) -> list[float]:

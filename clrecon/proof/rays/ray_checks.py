@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
 from clrecon.opencl import Device, Stopwatch, download, upload
+from clrecon.operators.rays.openness import Hiding, find_openness
 from clrecon.operators.rays.picture_buffers import TILE, PictureBuffers, RayView, Shot
 from clrecon.operators.rays.point_pictures import Discs, draw_splats
 from clrecon.operators.rays.ray_pictures import MainWay, enter_tiles, look_ahead, take_picture
@@ -45,10 +46,12 @@ from clrecon.proof.checking import (
     stack,
 )
 from clrecon.proof.rays.objects import find_splats, shade_splats
+from clrecon.proof.rays.openness import OpenPlaces
 from clrecon.proof.rays.render import cast_rays, smooth_field
 from clrecon.proof.rays.surface import cast_surface as surface_twin
 from clrecon.proof.rays.surface import overlay_slices as overlay_twin
 from clrecon.rendering import UNSHADED, Lighting, Rendering, TransferFunction
+from clrecon.rendering.pictures.label_style import LabelStyle
 from clrecon.rendering.pictures.styles import Projection, SlicesInSpace, SurfaceLook, VolumeLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip
@@ -182,7 +185,40 @@ def _check_smoothing(device: Device) -> str:
     return f"{len(TYPES)} x {voxels.size:,} voxels smoothed along three axes, the same bits"
 
 
+_OPEN_SHAPE = (23, 24, 25)
+"""Voxels (k, j, i) of which each is a cell of the grid of openness: lines along each axis are more than 500."""
+
+
+def _check_openness(device: Device) -> str:
+    """Compare the grid of openness of random voxels with the twin's, cut by a plane and with a translucent label."""
+    rng = np.random.default_rng(26)
+    opacities = rng.random(4096).astype(np.float32) ** 3
+    for dtype in TYPES:
+        voxels = rng.integers(0, 120, _OPEN_SHAPE).astype(dtype)
+        volume = stack(voxels, OBLIQUE)
+        clip = Clip.plane(centre_of(volume), (0.5, 0.4, 1.0))
+        look = LabelStyle.of(LabelMap((voxels % 3).astype(np.uint8), OBLIQUE), None, {2: 0.25})
+        nodes = np.clip(np.floor(volume.voxels * 30.0 + 0.5), 0, 4095).astype(np.int64)
+        for labels in (None, look):
+            resident = DeviceVolume(volume, device=device)
+            placed = None if labels is None else resident.bring(labels.labels)
+            hiding = Hiding(upload(device, opacities), 4096, 0.0, 30.0, clip.planes, placed, labels)
+            openness = find_openness(resident, _OPEN_SHAPE[0], hiding, Stopwatch())
+            grid = download(device, np.empty(openness.cells.counts[::-1], dtype), openness.grid_d)
+            opacity = opacities[nodes]
+            if labels is not None:
+                opacity = opacity * labels.table[labels.labels.voxels, 3]
+            require_equal(grid, OpenPlaces(volume, opacity, clip).grid, f"openness of {dtype} voxels")
+    return f"{len(TYPES)} x {grid.size:,} cells as open as computed"
+
+
 LEAP_CHECKS = (
+    Check(
+        "openness of places",
+        ("fill_cells", "sweep_light", "finish_openness"),
+        _check_openness,
+        {"rays/openness.cl": ("LABELS",)},
+    ),
     Check("smoothed light", ("smooth_along",), _check_smoothing),
     Check(
         "leaps of rays", ("measure_cells", "mark_bricks", "spread_in_rows", "spread_along", "look_ahead"), _check_leaps
@@ -220,6 +256,9 @@ STEEP = TransferFunction([(-200, 0.8, 0.1, 0.1, 0), (100, 1, 0.6, 0.3, 0), (130,
 _BY_GRADIENT = TransferFunction(
     SOFT.points, unit_distance=2.0, gradient_opacity=[(20.0, 0.0), (150.0, 1.0), (600, 0.3)]
 )
+_DENSE = TransferFunction([(-200, 0.9, 0.2, 0.1, 0.0), (600, 1, 0.7, 0.4, 0.95)])
+"""A transfer function by which hollows of the blobs are up to 10 of 255 darker with ambient occlusion."""
+
 _DIM = TransferFunction([(20, 0.9, 0.2, 0.1, 0.0), (90, 1, 0.7, 0.4, 0.2), (130, 1, 1, 0.9, 0.6)])
 """A transfer function for voxels of 8 bits."""
 
@@ -252,7 +291,10 @@ def _check_composite(device: Device, scenes: tuple[tuple[str, TransferFunction, 
         clip = _cut_middle(volume) if options.get("cut") else None
         camera = look_at(volume, (0.4, 1.0, -0.3), 7.0, perspective=options.get("perspective", True))
         step = options.get("step", 0.5 * min(volume.spacing))
-        style = VolumeLook(function, lighting=lighting, jitter=jitter, clip=clip, ray_step=step)
+        style = VolumeLook(
+            function, lighting=lighting, jitter=jitter, clip=clip, ray_step=step,
+            ambient_occlusion=options.get("ambient_occlusion", 0.0),
+        )  # fmt: skip
         picture = take_picture(DeviceVolume(volume, device=device), style, Shot(camera, SIZE), step)
         twin = cast_rays(volume, style, camera, SIZE)
         image = 255.0 * np.clip(twin.rgba, 0.0, 1.0)
@@ -322,14 +364,16 @@ def _check_projections(device: Device, kinds: tuple[str, ...], uneven: bool) -> 
     return f"values of {', '.join(kinds)} within {worst:.1g}"
 
 
-def _check_surfaces(device: Device, uneven: bool) -> str:
+def _check_surfaces(device: Device, uneven: bool, ambient_occlusion: float = 0.0) -> str:
     worst = 0.0
     for dtype, iso_value, shadows in (("int16", 100.0, False), ("uint8", 75.0, False), ("float32", 100.0, True)):
         volume = blobs(_PICTURE_SHAPE, OBLIQUE, dtype, uneven=uneven)
         clip = _cut_middle(volume) if dtype == "float32" else None
         camera = look_at(volume, (0.4, 1.0, -0.3), 7.0, perspective=dtype == "float32")
         step = 0.5 * min(volume.spacing)
-        style = SurfaceLook(iso_value, color="white", shadows=shadows, lighting=FIXED, clip=clip)
+        style = SurfaceLook(
+            iso_value, color="white", shadows=shadows, lighting=FIXED, clip=clip, ambient_occlusion=ambient_occlusion
+        )
         picture = cast_surface(DeviceVolume(volume, device=device), style, Shot(camera, SIZE), step)
         twin = surface_twin(volume, style, camera, SIZE)
         image = 255.0 * np.clip(twin.rgba, 0.0, 1.0)
@@ -393,6 +437,7 @@ def _check_points(device: Device) -> str:
     return f"2 pictures of {SIZE[0]} x {SIZE[1]} pixels within {worst:.1f} of 255"
 
 
+_OPENED = ("fill_cells", "sweep_light", "finish_openness")
 _PREPARED = ("measure_cells", "mark_bricks", "spread_in_rows", "spread_along")
 RENDERED = (*_PREPARED, "enter_tiles", "look_ahead", "composite_rays")
 _PROJECTED = ("measure_cells", "project_rays")
@@ -446,6 +491,16 @@ PICTURE_CHECKS = (
         "UNEVEN",
         scenes=(("int16", SOFT, True, {}), ("float32", SOFT, True, {"cut": True})),
     ),
+    _check_last(
+        "ambient occlusion in volume rendering",
+        (*_OPENED, *RENDERED),
+        _check_composite,
+        "OPENNESS",
+        scenes=(
+            ("int16", _DENSE, False, {"ambient_occlusion": 1.0}),
+            ("float32", _DENSE, False, {"cut": True, "ambient_occlusion": 0.9}),
+        ),
+    ),
     _check_last("labels in volume rendering", RENDERED, _check_composite_labels, "LABELS"),
     _check_last("projections", _PROJECTED, _check_projections, kinds=("mip", "minip", "mean"), uneven=False),
     _check_last("radiographs", _PROJECTED, _check_projections, "LEAST_VALUE", kinds=("drr",), uneven=False),
@@ -460,6 +515,14 @@ PICTURE_CHECKS = (
     ),
     _check_last("surfaces without a mesh", _TRACED, _check_surfaces, uneven=False),
     _check_last("surfaces of uneven slices", _TRACED, _check_surfaces, "UNEVEN", uneven=True),
+    _check_last(
+        "ambient occlusion on surfaces",
+        (*_OPENED, *_TRACED),
+        _check_surfaces,
+        "OPENNESS",
+        uneven=False,
+        ambient_occlusion=0.7,
+    ),
     _check_last("labels on surfaces", _TRACED, _check_surface_labels, "LABELS"),
     Check("slices in space", ("overlay_slices",), _check_slices),
     Check("points as discs", ("clear_splats", "splat_depths", "splat_numbers", "shade_splats"), _check_points),

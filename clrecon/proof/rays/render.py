@@ -9,7 +9,7 @@ References: Levoy 1988, "Display of surfaces from volume data" (compositing fron
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array, slice_normal
 from clrecon.geometry.iso_rule import slice_normal_matrices, takes_parts
+from clrecon.proof.rays.openness import cell_length, open_volume
 from clrecon.rendering import Lighting, TransferFunction
 from clrecon.rendering.looks.lighting import LEAST_SOFT_GRADIENT
 from clrecon.rendering.looks.piecewise import DENSE, PARTS, STEEP, Steepness
@@ -260,7 +261,7 @@ def cast_rays(
         part = jitter_pixels(width, height).ravel() if style.jitter else np.full(rays.count, 0.5)
         if lit is None:
             lit = smooth_field(volume, style.smooth_light if style.light.shades else 0.0)
-        result = _composite(rays, style.function, style.light, step, part, lit)
+        result = _composite(rays, style, step, part, lit)
     elif style.kind in ("mean", "drr"):
         result = _integrate(rays, step, as_water=style.kind == "drr")
     else:
@@ -291,13 +292,14 @@ def shade(
     lighting: Lighting,
     lit: ArrayLike = 1.0,
     soft_gradient: float = 0.0,
+    open_share: ArrayLike = 1.0,
 ) -> Float64Array:
     """Shade colours (n, 3) after Phong with gradients (n, 3) as normals, seen along directions (n, 3).
 
     Normals are turned towards the camera, and a fixed light only lights surfaces that face it.  A zero gradient has no
     direction: its colour gets full diffuse light and no highlight.  `lit` 0 means in shadow: only ambient light.  With
-    `soft_gradient` (HU per mm) directions of small gradients count less, see `clrecon.rendering.Lighting`. Colours
-    above 1 become 1.
+    `soft_gradient` (HU per mm) directions of small gradients count less, see `clrecon.rendering.Lighting`. Of all light
+    `open_share` reaches the places.  Colours above 1 become 1.
     """
     magnitude = np.linalg.norm(gradients, axis=1)
     flat = magnitude < _FLAT_GRADIENT
@@ -319,13 +321,25 @@ def shade(
     diffuse, highlight = 1.0 + certain * (diffuse - 1.0), certain * highlight
     share = np.broadcast_to(np.asarray(lit, dtype=np.float64), magnitude.shape)
     light = lighting.ambient + share * lighting.diffuse * diffuse
-    return np.minimum(colours * light[:, None] + (share * lighting.specular * highlight)[:, None], 1.0)
+    shaded = colours * light[:, None] + (share * lighting.specular * highlight)[:, None]
+    return np.minimum(np.broadcast_to(open_share, magnitude.shape)[:, None] * shaded, 1.0)
 
 
-def _composite(
-    rays: _Rays, transfer_function: TransferFunction, lighting: Lighting, step: float, part: Float64Array, lit: NDArray
-) -> Found:
+def _find_light(volume: Volume, style: VolumeLook) -> Callable[[Float64Array], Float64Array]:
+    """Return what tells the share of the light that reaches places of index coordinates (n, 3)."""
+    length = cell_length(volume)
+
+    def find_opacity(voxels: NDArray) -> NDArray:
+        let_through = 1.0 - look_up(style.function, voxels.astype(np.float64))[..., 3]
+        return np.asarray(1.0 - let_through ** (length / style.function.unit_distance))
+
+    return open_volume(volume, find_opacity, style.ambient_occlusion, style.clip)
+
+
+def _composite(rays: _Rays, style: VolumeLook, step: float, part: Float64Array, lit: NDArray) -> Found:
     voxels = rays.volume.voxels
+    transfer_function, lighting = style.function, style.light
+    find_light = _find_light(rays.volume, style)
     matrices = slice_normal_matrices(rays.volume, 0)
     gradients, lit_gradients = voxel_gradients(voxels, matrices), voxel_gradients(lit, matrices)
     rgba = np.zeros((rays.count, 4))
@@ -348,7 +362,9 @@ def _composite(
             opacity = opacity * transfer_function.gradient_factor(np.linalg.norm(slope, axis=1))
         slope = sample_field(lit_gradients, ijk)
         softness = max(lighting.soft_gradient, LEAST_SOFT_GRADIENT)
-        colour = shade(colour, slope, rays.directions[ray], lighting, soft_gradient=softness)
+        colour = shade(
+            colour, slope, rays.directions[ray], lighting, soft_gradient=softness, open_share=find_light(ijk)
+        )
         opacity = 1.0 - (1.0 - opacity) ** (length / transfer_function.unit_distance)
         weight = (1.0 - rgba[ray, 3]) * opacity
         rgba[ray, :3] += weight[:, None] * colour

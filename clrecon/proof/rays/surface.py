@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.iso_rule import choose_iso_rule, slice_normal_matrices
+from clrecon.proof.rays.openness import open_volume
 from clrecon.proof.rays.render import RayPicture, box_of, find_interval, sample_field, shade, voxel_gradients
 from clrecon.rendering.pictures.styles import SlicesInSpace, SurfaceLook
 from clrecon.rendering.views.camera import Camera
@@ -78,6 +79,8 @@ def cast_surface(volume: Volume, style: SurfaceLook, camera: Camera, size: Seque
         blocked, _ = _first_inside(field, points, towards, np.full(len(rays_hit), step), far, step)
         lit = np.where(np.isnan(blocked), 1.0, 0.0)
     colours = shade(np.broadcast_to(style.rgb, points.shape), normals, directions[rays_hit], style.light, lit)
+    find_light = open_volume(volume, lambda voxels: voxels >= field.level, style.ambient_occlusion, style.clip)
+    colours = colours * find_light(volume.lps_to_ijk(points))[:, None]
     rgba = np.zeros((len(origins), 4))
     rgba[rays_hit] = np.column_stack([colours, np.ones(len(rays_hit))])
     width, height = size

@@ -76,6 +76,7 @@ class Look(TypedDict, total=False):
     iso_value: float
     color: Color | None
     shadows: bool
+    ambient_occlusion: float
     depth_cue: float | None
     slices: int | Sequence[int] | None
     slice_opacity: float

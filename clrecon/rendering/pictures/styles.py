@@ -131,6 +131,10 @@ class _Labelled(Style):
 class _Lit(_Labelled, Lit):
     lighting: Lighting | None = style_field(None, checks.instance_of("lighting", Lighting))
     ray_step: float | None = style_field(None, checks.ray_step)
+    ambient_occlusion: float = style_field(
+        0.0,
+        checks.number("ambient occlusion is a share of the light from 0 to 1, not", lambda share: 0.0 <= share <= 1.0),
+    )
     clip: Clip | None = style_field(None, checks.instance_of("clip", Clip))
 
 
@@ -148,6 +152,8 @@ class VolumeLook(_Lit):
         mm between samples; default: half the smallest spacing of the volume.
     jitter : bool
         Place each sample at random within its step: fine noise instead of rings.
+    ambient_occlusion : float
+        Share of the light that is lost in hollows, where what is around lets none through: 0 to 1; 0: none is lost.
     smooth_light : float, optional
         Light comes from gradients of the volume smoothed by a Gaussian of this standard deviation in mm; colours and
         opacities are those of the volume itself.  0: no smoothing; default: about a voxel, more for a noisy scan.
@@ -272,6 +278,8 @@ class SurfaceLook(_Lit):
         Default: ``Lighting()``.
     ray_step : float, optional
         mm between samples; default: half the smallest spacing of the volume.
+    ambient_occlusion : float
+        As of `VolumeLook`.
     clip : Clip, optional
         The part of space that is shown; cuts are capped.
     labels, label_colors, label_opacity

@@ -65,9 +65,11 @@ CUTS: Wrong = {
     "window": [((5, 5), "a window is its lowest and highest HU"), (100, "window")],
     "pixel_mm": [(0.0, "the size of a pixel is a length in mm"), ("1", None)],
 }
+OCCLUDED: Wrong = {"ambient_occlusion": [(1.5, "from 0 to 1, not 1.5"), (-0.1, "occlusion"), (TWO, "occlusion")]}
 WRONG: dict[type[Style], Wrong] = {
     VolumeLook: {
         **LABELLED,
+        **OCCLUDED,
         "transfer_function": [("bones", "unknown rendering preset 'bones'"), ([(0, 1, 1, 1, 1)], "not list")],
         "jitter": [("no", "jitter is True or False, not 'no'"), (1, "jitter")],
         "smooth_light": [(-1.0, "a length in mm from 0 to 20, not -1"), (21.0, "smoothing"), (np.nan, "smoothing")],
@@ -81,6 +83,7 @@ WRONG: dict[type[Style], Wrong] = {
     PresetSheet: {**RAYS},
     SurfaceLook: {
         **LABELLED,
+        **OCCLUDED,
         "iso_value": [(np.nan, "iso value is nan"), ("bone", "a number of HU"), (1e300, "beyond"), (None, "iso value")],
         "color": [("octarine", "unknown colour 'octarine'"), (TWO, "colour")],
         "shadows": [(True, "a light that stands still"), (TWO, "shadows is True or False")],
