@@ -116,7 +116,8 @@ def find_changed_intersections(
         return np.zeros((0, 2), dtype=np.int64)
     if np.count_nonzero(changed) > _FEW * len(triangles):
         return find_crossings(vertices, triangles, None if changed.all() else changed)
-    rows = np.flatnonzero(find_beside(vertices, triangles, changed))
+    rows = _find_meeting(vertices, triangles, changed)
+    rows = rows[find_beside(vertices, triangles[rows], changed[rows])]
     return rows[find_self_intersections(vertices, triangles[rows], changed[rows])]
 
 
@@ -126,6 +127,23 @@ def find_beside(
     """Find the changed triangles and those that can touch one of them: whose box shares a coarse cell with one."""
     low, high = find_boxes(vertices, triangles)
     return find_boxes_beside(low, high, low[changed], high[changed])
+
+
+def _find_meeting(
+    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], changed: NDArray[np.bool_]
+) -> NDArray[np.intp]:
+    """Return the triangles whose span along each axis meets that of a changed one, where these leave out many."""
+    low, high = find_boxes(vertices, triangles[changed])
+    rows = np.arange(len(triangles))
+    for axis in range(3):
+        order, corners = np.argsort(low[:, axis]), vertices[:, axis].take(triangles[rows].T)
+        before = np.searchsorted(low[order, axis], np.maximum.reduce(corners), side="right")
+        farthest = np.append(np.maximum.accumulate(high[order, axis]), -np.inf)
+        meets = farthest[before - 1] >= np.minimum.reduce(corners)
+        rows = rows[meets]
+        if 2 * len(rows) > len(meets):
+            break
+    return rows
 
 
 def find_boxes(

@@ -153,6 +153,9 @@ class _Decimation:
         before = self._history.count
         self._witnesses = np.full((4, self._mesh.triangle_count), SEVERAL, np.int32)
         self._is_new = np.ones(self._mesh.vertex_count, dtype=bool)
+        self._is_shifted = np.zeros(self._mesh.vertex_count, dtype=bool)
+        self._kind = as_stored(self._history.places + self._origin).dtype
+        self._stored = self._mesh.vertices.astype(np.result_type(self._kind, self._mesh.vertices))
         while True:
             self._name()
             collapses = self._latest_of([*self._find_far(), *self._find_unsound()])
@@ -169,10 +172,13 @@ class _Decimation:
         self._rows = np.flatnonzero((a != b) & (b != c) & (c != a))
         self._faces = named.take(self._rows, axis=0)
         self._is_new_face = any_corner(self._is_new, self._faces)
-        stored = as_stored(self._history.places + self._origin)
-        self._has_moved = (self._history.places != self._given.places).any(axis=1)
-        self._stored = np.where(self._has_moved[:, None], stored, self._mesh.vertices)
-        self._has_moved |= self._names != np.arange(len(self._names))
+        new = np.flatnonzero(self._is_new)
+        places, given = self._history.places.take(new, axis=0), self._mesh.vertices.take(new, axis=0)
+        shifted = (places != self._given.places.take(new, axis=0)).any(axis=1)
+        stored = (places + self._origin).astype(self._kind)
+        self._stored[new] = np.where(shifted[:, None], stored, given)
+        self._is_shifted[new] = shifted
+        self._has_moved = self._is_shifted | (self._names != np.arange(len(self._names)))
 
     def _find_far(self) -> Iterator[IntArray]:
         """Find the names at triangles that are not seen to lie within the bound of the other surface.
@@ -202,7 +208,8 @@ class _Decimation:
         is_unseen[new] = True
         is_unseen[[SEVERAL, FAR]] = True  # from the end, and -1 is no face
         has_none = np.logical_or.reduce([is_unseen[faces] for faces in self._witnesses])
-        return np.flatnonzero(has_none & any_corner(self._has_moved, self._mesh.triangles))
+        rows = np.flatnonzero(has_none)
+        return rows[any_corner(self._has_moved, self._mesh.triangles.take(rows, axis=0))]
 
     def _find_unsound(self) -> Iterator[IntArray]:
         """Find the names at faces that cut each other or have no area, and at vertices that coincide."""
