@@ -86,7 +86,7 @@ def test_source_distribution_takes_every_file_of_the_project() -> None:
     lines = [line.split() for line in (ROOT / "MANIFEST.in").read_text(encoding="utf-8").splitlines()]
     folders = {name for word, *names in lines if word == "graft" for name in names} | {"clrecon"}
     patterns = [name for word, *names in lines if word == "include" for name in names]
-    by_setuptools = {"LICENSE", "MANIFEST.in", "pyproject.toml", "setup.cfg"}
+    by_setuptools = {"LICENSE", "MANIFEST.in", "pyproject.toml", "setup.cfg", "PKG-INFO"}
     left_out = {
         name
         for path in project_files()
