@@ -38,7 +38,7 @@ def copy_tool(name: str, site: Path) -> str:
     for file in tool.files or ():
         if ".." not in file.parts and file.suffix != ".pyc":
             (site / file).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy(tool.locate_file(file), site / file)  # type: ignore[arg-type]
+            shutil.copy(str(tool.locate_file(file)), site / file)
     return tool.version
 
 

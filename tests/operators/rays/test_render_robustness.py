@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import threading
 from typing import Any
@@ -228,6 +229,17 @@ def test_three_threads_that_share_a_renderer_get_the_picture_of_their_own_functi
         for thread in threads:
             thread.join()
     assert wrong == []
+
+
+def render_bytes(index: int) -> bytes:
+    """The picture of a body on the device with this index."""
+    return clrecon.render(random_body(), size=SIZE, device=index).image.tobytes()
+
+
+def test_process_started_by_spawn_as_on_macos_and_windows_draws_the_same_picture(device) -> None:
+    here = render_bytes(device.index)
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        assert pool.apply(render_bytes, (device.index,)) == here
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
