@@ -24,7 +24,7 @@ from clrecon.rendering.pictures.styles import CurveCut, Projection, SlicesInSpac
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.directions import as_point, checked_size
 from clrecon.rendering.views.reformation import find_plane
-from clrecon.system.light_dataclass import dataclass
+from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.progress import Progress
 from clrecon.viewer.drawing.looks import LEAST_OPACITY, LabelledLook, Looks, to_voxels
 from clrecon.viewer.drawing.shown_meshes import divide_surface, make_meshes
@@ -115,7 +115,7 @@ class Painter(Stage):
         with self.lock:
             _stop(cancelled)
             begun = perf_counter()
-            rendering = self._take(self._drawn(state, sharp), state, (width, height), cancelled)
+            rendering = self._take_state(state, (width, height), sharp, cancelled)
             rendering.report["ms"] = 1000.0 * (perf_counter() - begun)
             rendering.report["sharp"] = sharp
             return rendering
@@ -123,18 +123,23 @@ class Painter(Stage):
     def slice(self, state: ViewState, plane: str, size: Sequence[int]) -> Rendering:
         """Cut a slice ("axial", "coronal" or "sagittal") through the cross; empty where there is no scan."""
         width, height = checked_size(size)
+        if state.compare is not None:
+            camera = self.slice_camera(state, plane, (width, height))
+            return join_sides([self._slice_at(side, plane, camera, (width, height)) for side in state.sides], state)
+        return self._slice_at(state, plane, self.slice_camera(state, plane, (width, height)), (width, height))
+
+    def _slice_at(self, state: ViewState, plane: str, camera: Camera, size: tuple[int, int]) -> Rendering:
         with self.lock:
             sliced = self._sliced(state)
             if sliced is None:
-                return self._empty(state, (width, height), "slice", self.slice_camera(state, plane, (width, height)))
+                return self._empty(state, size, "slice", camera)
             resident, labelled = sliced
-            camera = self.slice_camera(state, plane, (width, height))
             style = self._looks.plane(state, labelled, 0.0)
             self.place(resident, labelled)
             try:
-                return self.renderer(resident).render(style, camera=camera, size=(width, height))
+                return self.renderer(resident).render(style, camera=camera, size=size)
             except UsageError:  # the cross lies beside an oblique scan
-                return self._empty(state, (width, height), "slice", camera)
+                return self._empty(state, size, "slice", camera)
 
     def slice_camera(self, state: ViewState, plane: str, size: Sequence[int]) -> Camera:
         """Return the camera of a slice: its focal point lies in the slice, so that places can be told from pixels."""
@@ -154,6 +159,7 @@ class Painter(Stage):
     def pick(self, state: ViewState, size: Sequence[int], x: float, y: float) -> Pick | None:
         """Return what is seen at a pixel (x, y) from the top left corner of a picture of this size, or None."""
         camera = pixel_camera(state.camera, checked_size(size), x, y)
+        state = _find_side(state, x / size[0])
         nearest: tuple[float, _Drawn] | None = None
         with self.lock:
             for drawn in self._drawn(state, sharp=True, opaque=True):
@@ -173,6 +179,7 @@ class Painter(Stage):
     def pick_slice(self, state: ViewState, plane: str, size: Sequence[int], x: float, y: float) -> Pick:
         camera = self.slice_camera(state, plane, checked_size(size))
         point = pixel_camera(camera, checked_size(size), x, y).focal_point
+        state = _find_side(state, x / size[0])
         with self.lock:
             key, number = None, None
             sliced = self._sliced(state)
@@ -307,6 +314,18 @@ class Painter(Stage):
                 return drawn.subject, drawn.labelled
         return None
 
+    def _take_state(
+        self, state: ViewState, size: tuple[int, int], sharp: bool, cancelled: Callable[[], bool]
+    ) -> Rendering:
+        """Take the picture of a state; of a comparison both sides with one camera, each where it is seen."""
+        if state.compare is None:
+            return self._take(self._drawn(state, sharp), state, size, cancelled)
+        pictures = []
+        for side in state.sides:
+            _stop(cancelled)
+            pictures.append(self._take(self._drawn(side, sharp), side, size, cancelled))
+        return join_sides(pictures, state)
+
     def _take(
         self,
         drawn: list[_Drawn],
@@ -352,6 +371,28 @@ class Painter(Stage):
 
 
 _SURFACE = find_modes()["surface"]
+
+
+def _find_side(state: ViewState, share: float) -> ViewState:
+    """Return what of a comparison is shown at a share of the width from the left; other states as they are."""
+    if state.compare is None:
+        return state
+    left, right = state.sides
+    return left if share < state.compare else right
+
+
+def join_sides(pictures: Sequence[Rendering], state: ViewState) -> Rendering:
+    """Return the first of two pictures of one size left of the line of a comparison, and the second right of it."""
+    left, right = pictures
+    assert state.compare is not None
+    column = round(state.compare * left.size[0])
+    joined: dict[str, Any] = {
+        name: np.concatenate([getattr(left, name)[:, :column], getattr(right, name)[:, column:]], axis=1)
+        for name in ("image", "depth", "expected_depth")
+    }
+    warnings = dict.fromkeys([*left.report["warnings"], *right.report["warnings"]])
+    report = {**right.report, **left.report, "warnings": list(warnings)}
+    return replace(left, values=None, report=report, **joined)
 
 
 def _key_of(labelled: LabelledLook, number: int) -> str | None:

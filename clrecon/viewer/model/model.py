@@ -280,6 +280,29 @@ class ViewModel(ChangingView):
             raise UsageError(unknown_name("layout", name, LAYOUTS))
         self._change("layout", "the layout", layout=name)
 
+    @property
+    def is_comparable(self) -> bool:
+        """True where there are two inputs and more beside label maps."""
+        return len(self.objects) - len(self.label_maps) > 1
+
+    def set_compare(self, share: float | None) -> None:
+        """Show the first input left of a line, the others right of it; the line is at a share of the width, None: no
+        line, all inputs together."""
+        if share is None:
+            self._change("compare", "the comparison", compare=None)
+            return
+        if not self.is_comparable:
+            raise UsageError("there is one input: a comparison needs two scans or meshes")
+        (value,) = checked_numbers("the line of a comparison", share)
+        if not 0.0 <= value <= 1.0:
+            raise UsageError(f"the line of a comparison lies at a share of the width from 0 to 1, not at {value:g}")
+        words = "the comparison" if self.state.compare is None else "the line of the comparison"
+        self._change("compare" if self.state.compare is None else "move compare", words, compare=value)
+
+    def toggle_compare(self) -> None:
+        """Compare with the line in the middle, or show all inputs together."""
+        self.set_compare(0.5 if self.state.compare is None else None)
+
     def step_layout(self) -> None:
         self.set_layout(LAYOUTS[(LAYOUTS.index(self.state.layout) + 1) % len(LAYOUTS)])
 
@@ -414,9 +437,10 @@ class ViewModel(ChangingView):
         mode = self.modes[state.mode]
         notes = []
         hidden = [each.name for each in self.objects if each.kind != "labels"][1:]
-        if not mode.joins and hidden:
+        together = state.compare is None  # otherwise inputs have pictures of their own
+        if together and not mode.joins and hidden:
             notes.append(f"a picture of mode {mode.name} shows one scan alone: {', '.join(hidden)} left out")
-        elif mode.kind in ("volume", "slices") and len(self.scans) > 1:
+        elif together and mode.kind in ("volume", "slices") and len(self.scans) > 1:
             others = ", ".join(each.name for each in self.scans[1:])
             notes.append(f"one scan is shown in mode {mode.name}, {others} by the surface")
         if self._is_edge_on(mode):
@@ -443,6 +467,8 @@ class ViewModel(ChangingView):
             "turned": state.turn is not None,
             "slab": {"mm": state.slab_mm, "combine": state.combine},
             "layout": state.layout,
+            "comparable": self.is_comparable,
+            "compare": state.compare,
             "cross_text": self.say_place(state.cross),
             "parts": [each.describe() for each in state.parts],
             "parts_known": self.parts_known,

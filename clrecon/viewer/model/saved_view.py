@@ -44,6 +44,7 @@ def encode_view(state: ViewState, objects: Sequence[ShownObject]) -> bytes:
         "turn": None if state.turn is None else [list(row) for row in state.turn],
         "slab": {"thickness_mm": state.slab_mm, "combine": state.combine},
         "layout": state.layout,
+        "compare": state.compare,
         "slices": [_describe_frame(each) for each in state.frames],
         "parts": [_describe_look(each) for each in state.parts if not each.is_plain],
         "measures": [
@@ -140,6 +141,7 @@ def _apply(saved: Mapping[str, Any], trial: ViewModel) -> None:
     trial.state = replace(trial.state, turn=checked_turn(saved["turn"]))
     trial.set_slab(saved["slab"]["thickness_mm"], saved["slab"]["combine"])
     trial.set_layout(saved["layout"])
+    trial.set_compare(saved["compare"])
     for frame in saved["slices"]:
         check_plane(frame["plane"])
         if not LEAST_ZOOM <= frame["zoom"] <= MOST_ZOOM:

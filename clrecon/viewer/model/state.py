@@ -13,7 +13,7 @@ from clrecon.rendering.pictures.annotations import orientation_letters
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.directions import DIRECTIONS, checked_vector
-from clrecon.system.light_dataclass import dataclass
+from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.text import unknown_name
 from clrecon.viewer.model.measures import Measure, Point
 
@@ -179,6 +179,8 @@ class ViewState:
     turn: Of the three slices, about the cross; None: they lie along the axes of the patient.
     slab_mm: Thickness of the slices, 0 for planes; `combine` is what is shown of its samples.
     layout: One of `LAYOUTS`.
+    compare: Where pictures and slices are divided, a share of their width: the first input is shown left of it, the
+        others right of it.  None: all are shown together.
     frames: Of the slices that were zoomed or shifted; the others fit.
     parts_at: Iso value of the clusters; None: they are not known.
     parts_table: Of which volume, see `table`.
@@ -194,6 +196,7 @@ class ViewState:
     slab_mm: float = 0.0
     combine: Literal["mean", "max", "min"] = "mean"
     layout: str = "1+3"
+    compare: float | None = None
     frames: tuple[SliceFrame, ...] = ()
     picture_window: tuple[float, float] | None = None
     table: bool = True
@@ -223,6 +226,21 @@ class ViewState:
             return tuple(each.point for each in self.points)
         return next((each.points for each in reversed(self.measures) if each.kind == "curve"), ())
 
+    @property
+    def sides(self) -> tuple[ViewState, ViewState]:
+        """The state with the first input alone, and with the others: left and right of the line of `compare`."""
+        inputs = [each for each in self.parts if each.is_whole and each.kind != "labels"]
+
+        def show_some(numbers: set[int]) -> ViewState:
+            parts = tuple(
+                replace(each, visible=each.visible and each.object in numbers) if each in inputs else each
+                for each in self.parts
+            )
+            return replace(self, compare=None, parts=parts)
+
+        first, *others = (each.object for each in inputs)
+        return show_some({first}), show_some(set(others))
+
     def frame(self, plane: str) -> SliceFrame | None:
         return next((each for each in self.frames if each.plane == plane), None)
 
@@ -249,7 +267,7 @@ def picture_key(state: ViewState, view: str) -> Hashable:
         cut = (state.clips, state.clip_box)
         return (
             *(state.camera, state.mode, state.iso_value, state.picture_window, state.table),
-            *(state.fitted, state.color_by, parts, cut),
+            *(state.fitted, state.color_by, parts, cut, state.compare),
         )
     if view in SLICES:
         return (
@@ -261,5 +279,6 @@ def picture_key(state: ViewState, view: str) -> Hashable:
             state.combine,
             state.table,
             parts,
+            state.compare,
         )
     return (state.curve, state.window, state.table)

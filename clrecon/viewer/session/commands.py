@@ -121,6 +121,9 @@ _model("set_slab", "slices of so many mm: mean, max or min of them", "set_slab",
 _model("step_slab", "thick slices: mean, max, or planes again", "step_slab")
 _model("set_layout", "lay the views out: 1, 1+3 or 4", "set_layout", name=_text)
 _model("step_layout", "lay the views out in the next way", "step_layout")
+_model("set_compare", "first input left of a line at a share of the width, others right; null: together", "set_compare",
+       share=_or_none(_check_number))  # fmt: skip
+_model("toggle_compare", "compare the first input with the others, or show all together", "toggle_compare")
 _session("find_spine", "find the canal of the spine, and make it a curve", "find_spine")
 _model("fit_slices", "show the slices as they fit", "fit_slices")
 _session("probe", "HU at a place, LPS mm", "probe", point=_check_numbers(3))
@@ -220,6 +223,7 @@ _SECTIONS: dict[str, dict[str, Key]] = {
         "6": _look_from("inferior"),
         "f": Key("parallel or perspective", {"do": "toggle_perspective"}),
         "g": Key("layout: picture alone, slices beside it, four views", {"do": "step_layout"}),
+        "v": Key("compare: first input left of a line, others right", {"do": "toggle_compare"}),
     },
     "Scan": {
         "o": Key("next mode; O: the one before", {"do": "step_mode", "steps": 1}),

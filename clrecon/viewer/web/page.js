@@ -233,6 +233,10 @@
     find("shade").hidden = !now.fitted;
     find("shade").value = now.color_by || "";
     find("perspective").checked = !now.camera.parallel;
+    find("compared").hidden = !now.comparable;
+    find("compare").checked = now.compare !== null;
+    find("divide").hidden = now.compare === null;
+    if (held !== find("divide") && now.compare !== null) find("divide").value = now.compare;
     find("undo").disabled = !now.undo;
     find("undo").title = now.undo ? `take back ${now.undo} (u)` : "nothing to take back (u)";
     if (told("window")) showWindow();
@@ -494,6 +498,8 @@
   find("fitted").onchange = () => run("set_fitted", { shown: find("fitted").checked });
   find("shade").onchange = () => run("set_color_by", { name: find("shade").value || null });
   find("perspective").onchange = () => run("set_perspective", { on: find("perspective").checked });
+  find("compare").onchange = () => run("set_compare", { share: find("compare").checked ? 0.5 : null });
+  hold(find("divide"), () => last("set_compare", { share: Number(find("divide").value) }));
   find("hu").addEventListener("wheel", (event) => {
     event.preventDefault();
     const by = -Math.sign(event.deltaY) * fixed.iso_step;

@@ -12,6 +12,7 @@
   }
 
   const WIDE = 240, FAIR = 190;  // pixels of a slice that has room for all of its words, for most of them
+  const HANDLE = 0.75;  // share of the height at which the line of a comparison has its handle
   const MOST_LETTERS = 24;  // of a name beside a picture; the list has all of it
 
   // What lies over a picture: sides of the patient, scale, cross, measures.
@@ -50,6 +51,7 @@
     if (facts && facts.scale && view.name === "scene") annotateScale(make, write, width, height);
     if (facts && facts.iso) annotateCross(view, make, segments, width, height);
     if (facts) annotateMeasures(view, line, write, width, height);
+    if (facts && facts.compare !== null) annotateCompare(view, make, line, write, width, height);
     if (facts && view.pointer && SLICES.includes(view.name)) annotateRegion(view, make);
     view.over.replaceChildren(...drawn);
   }
@@ -83,6 +85,19 @@
     ticks.forEach((tick, n) => write(String(tick), width - 32, low - (n / (ticks.length - 1)) * (low - top), "words", "end"));
     write(title, width - 12, top - 18, "words", "end");
   }
+
+  // The line of a comparison, with a handle to drag, and what is on either side of it.
+  function annotateCompare(view, make, line, write, width, height) {
+    const x = facts.compare * width, y = height * HANDLE, [first, second] = facts.objects.map(({ name }) => name);
+    for (const name of ["halo", "bar"]) line([[x, 0], [x, height]], name);
+    make("circle", { cx: x, cy: y, r: 9, class: "handle divide" });
+    if (width < WIDE) return;
+    write(first.slice(0, MOST_LETTERS), x - 16, y, "words", "end");
+    write(second.slice(0, MOST_LETTERS), x + 16, y, "words", "start");
+  }
+
+  const isDivider = (view, [x, y], reach) => Boolean(facts) && facts.compare !== null && view.name !== "curve"
+    && Math.hypot(x - facts.compare * view.box.clientWidth, y - HANDLE * view.box.clientHeight) < reach;
 
   // Where the slices meet: in a slice the lines of the two others, whose ends turn them, in the picture a short line
   // across each.
@@ -257,7 +272,8 @@
       last("hold", { on: true });
       delete view.angle;
       const reach = event.pointerType === "touch" ? INSET : INSET / 2;
-      view.turning = slice && !choosing && !event.shiftKey && event.button === 0 && fingers.size === 1
+      view.dividing = fingers.size === 1 && event.button === 0 && isDivider(view, at(event), reach);
+      view.turning = slice && !view.dividing && !choosing && !event.shiftKey && event.button === 0 && fingers.size === 1
         && isHandle(view, at(event), reach);
       if (view.turning) turnAt(view, ...at(event), true);  // from here on
     });
@@ -272,7 +288,11 @@
       const now = at(event), x = now[0] - before[0], y = now[1] - before[1], height = view.box.clientHeight;
       moved += Math.hypot(x, y);
       if (moved < 4) return;
-      if (fingers.size > 1) {
+      if (view.dividing) {
+        facts.compare = Math.min(Math.max(now[0] / view.box.clientWidth, 0), 1);
+        last("set_compare", { share: facts.compare });
+        for (const other of Object.values(views)) annotate(other);
+      } else if (fingers.size > 1) {
         const other = [...fingers].find(([id]) => id !== event.pointerId)[1];
         const apart = (finger) => Math.max(Math.hypot(finger[0] - other[0], finger[1] - other[1]), 1);
         panBy(view, x / 2, y / 2);
@@ -297,8 +317,8 @@
       view.box.addEventListener(name, (event) => {
         if (!fingers.delete(event.pointerId)) return;
         if (!fingers.size) last("hold", { on: false }, "release");
-        const turned = view.turning;
-        view.turning = false;
+        const turned = view.turning || view.dividing;
+        view.turning = view.dividing = false;
         if (name === "pointerup" && moved < 4 && event.button === 0 && !turned) click(view, at(event), event.shiftKey);
       });
     }

@@ -390,7 +390,7 @@ def pick_in_middle(sliced, number):
         lock=nullcontext(), hu_at=lambda point: 55.0, slice_camera=lambda *given: camera,
         _sliced=lambda state: sliced, _number_at=lambda scan, labelled, point: number,
     )  # fmt: skip
-    state = SimpleNamespace(part=lambda key: SimpleNamespace(object=7))
+    state = SimpleNamespace(compare=None, part=lambda key: SimpleNamespace(object=7))
     return Painter.pick_slice(painter, state, "axial", (40, 30), x=20.0, y=15.0), camera
 
 

@@ -85,6 +85,8 @@ CONTROLS = {
     "#save": Control("saved.textContent.includes('view.view.json')"),
     "#photo": Control("saved.textContent.includes('view.png')"),
     "#link": Control("saved.querySelector('a')?.href.includes('view=')"),
+    "#compare": Control("f.compare === 0.5"),
+    "#divide": Control("f.compare === 0.505", typed="\ue014"),
 }
 """Controls by their place on the page, in the order in which they are driven."""
 
