@@ -19,6 +19,7 @@ from clrecon.jobs.cluster import LOCAL
 from clrecon.jobs.devices import list_usable
 from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.jobs.options import ALL_DEVICES, DeviceSettings, ScanSettings, scheduler_option, view_option
+from clrecon.reading import tell_format
 from clrecon.reading.sources import open_remote
 from clrecon.reading.urls import check_url, is_url, refuse_url
 from clrecon.system.arguments import DirectionName, name_parameter
@@ -384,7 +385,7 @@ def _find_series(folder: str | Path, selection: ScanSettings) -> list[Case]:
         raise UsageError(
             f"each series of a folder is a case: leave {name_parameter('series')} out, or write a manifest"
         )
-    stacks = list_stacks(folder, selection)
+    stacks = list_stacks(folder, selection) if tell_format(folder) is None else []
     if not stacks:
         raise NoDicomError(
             "no series of CT slices in this folder; files of other formats are named by a manifest, a table of"

@@ -1,8 +1,7 @@
 """OME-Zarr (ngff.openmicroscopy.org) by the package zarr: the full level of the first image of a folder.
 
-Metadata name the axes with unit, scale and translation, but place them in no patient, unless they say an orientation
-(RFC-4).  zarr takes a file of chunks that is missing for the fill value, and of several chunks also an empty one: both
-are looked for here.
+Metadata name the axes, their unit, scale and translation, but no patient unless axes have an orientation (RFC-4).
+zarr takes a missing file of chunks for the fill value, and of several chunks also an empty one: both are looked for.
 """
 
 from __future__ import annotations
@@ -112,8 +111,9 @@ def _telling(name: str, section: str) -> Iterator[None]:
     except ClreconError:
         raise
     except Exception as error:
+        fault = "needs more memory" if isinstance(error, MemoryError) else "is corrupt, or nothing that zarr reads,"
         reason = escape_text(f"{type(error).__name__}: {error}", 160)
-        raise RefusedInputError(f"{name} is corrupt in {section}, or zarr cannot read it ({reason})") from error
+        raise RefusedInputError(f"{name} {fault} in {section} ({reason})") from error
 
 
 def _list_files(folder: Path, name: str) -> dict[Path, int]:
@@ -208,10 +208,8 @@ def _read_unit(axis: Mapping[str, Any], name: str) -> float:
     """Return the millimetres of a unit."""
     unit = axis.get("unit")
     if unit is None:
-        raise RefusedInputError(
-            f"{name} says no unit of its axis {escape_text(str(axis['name']), 20)}: add"
-            ' "unit": "millimeter" (or what is right) to the axes of its metadata'
-        )
+        word = escape_text(str(axis["name"]), 20)
+        raise RefusedInputError(f'{name} says no unit of its axis {word}: add "unit": "millimeter" to its metadata')
     if str(unit).lower() not in _MM_PER_UNIT:
         raise RefusedInputError(f"{name} has lengths in an unknown unit, {escape_text(str(unit), 20)}")
     return _MM_PER_UNIT[str(unit).lower()]

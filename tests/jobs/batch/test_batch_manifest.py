@@ -124,6 +124,12 @@ def test_folder_without_stacks_is_refused_and_the_columns_of_manifests_are_named
         read_cases(tmp_path, ScanSettings())
 
 
+def test_folder_of_zarr_is_refused_as_a_manifest_and_the_columns_of_manifests_are_named(tmp_path: Path) -> None:
+    (tmp_path / "zarr.json").write_text("{}")
+    with refused(NoDicomError, "case", "input", "labels"):
+        read_cases(tmp_path, ScanSettings())
+
+
 @pytest.mark.parametrize("output", ["ct/out", "."], ids=["within the input", "around the input"])
 def test_output_within_or_about_an_input_is_refused(output: str, tmp_path: Path) -> None:
     (tmp_path / "ct").mkdir()

@@ -6,6 +6,7 @@ import json
 import shutil
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ from volume_files import make_axes, make_ct, write_ome_zarr
 
 import clrecon
 from clrecon.errors import RefusedInputError, UsageError
+from clrecon.reading.grids import open_grid
+from clrecon.reading.grids.zarr_store import ZarrChunks
 from clrecon.system import memory
 
 pytest.importorskip("zarr")
@@ -187,6 +190,22 @@ def test_ome_zarr_is_refused_where_zarr_is_missing_with_its_name(
     monkeypatch.setitem(sys.modules, "zarr", None)
     with refused(UsageError, "zarr"):
         clrecon.read_volume(path)
+
+
+class Greedy:
+    """An array of which no part fits the memory."""
+
+    shape, chunks, ndim, dtype = SHAPE, SHAPE, 3, np.dtype(np.int16)
+
+    def __getitem__(self, selection: Any) -> np.ndarray:
+        raise MemoryError("Unable to allocate 72 MiB")
+
+
+def test_memory_that_is_too_small_for_a_layer_of_chunks_is_no_damage(tmp_path: Path) -> None:
+    grid = open_grid(write_ome_zarr(tmp_path / "a.zarr", make_ct(SHAPE)), "OME-Zarr", "volume")
+    greedy = replace(grid, voxel_bytes=ZarrChunks(tmp_path, Greedy(), (0, 1, 2), file_bytes=1000))
+    with refused(RefusedInputError, "a.zarr", "memory", 72):
+        next(greedy.iterate_slices())
 
 
 def test_volume_larger_than_the_free_memory_is_mapped_from_a_file(
