@@ -64,6 +64,10 @@ class DeviceLostError(DeviceFailedError):
     """The device was lost in the middle of the work: with a fresh context it may work."""
 
 
+class DeviceStoppedError(DeviceLostError):
+    """A kernel was stopped, by a watchdog or for want of memory: in a fresh context with less data it may work."""
+
+
 class DeviceTimeoutError(DeviceError):
     """The device made no progress for longer than the time limit."""
 

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, NamedTuple, TypeVar
 
-from clrecon.errors import DeviceError, DeviceFailedError, DeviceLostError, DeviceMemoryError
+from clrecon.errors import DeviceError, DeviceFailedError, DeviceLostError, DeviceMemoryError, DeviceStoppedError
 from clrecon.opencl import quirks
 from clrecon.opencl.cache import cache_warnings
 from clrecon.opencl.pocl import KnownGood, NameOfCpu, has_unknown_cpu, known_good
@@ -141,8 +141,9 @@ _NO_MEMORY = (-4, -5, -6)
 _LOST = (-2, -34, -36, -9999)
 """DEVICE_NOT_AVAILABLE, INVALID_CONTEXT, INVALID_COMMAND_QUEUE, and what NVIDIA says after a fault of a kernel."""
 
-_LOST_LATE = (-5, *_LOST)
-"""OUT_OF_RESOURCES of a command that was accepted says that it was stopped, by a watchdog or a fault."""
+_STOPPED_LATE = -5
+"""OUT_OF_RESOURCES of a command that was accepted says that it was stopped: by a watchdog, by a fault, or because the
+driver found memory for a buffer only when a kernel used it."""
 
 
 def kind_of_error(error: Exception, *, is_late: bool = False) -> type[DeviceError]:
@@ -151,7 +152,9 @@ def kind_of_error(error: Exception, *, is_late: bool = False) -> type[DeviceErro
         code = int(error.code)  # type: ignore[attr-defined]
     except (AttributeError, IndexError, TypeError, ValueError):
         code = 0
-    if code in (_LOST_LATE if is_late else _LOST):
+    if is_late and code == _STOPPED_LATE:
+        return DeviceStoppedError
+    if code in _LOST:
         return DeviceLostError
     if code in _NO_MEMORY or isinstance(error, quirks.import_pyopencl().MemoryError):
         return DeviceMemoryError

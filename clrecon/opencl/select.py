@@ -428,7 +428,7 @@ def _find_cpu(device: Device) -> Device | None:
 class Attempt(Generic[Given]):
     """One turn of a loop that tries again: errors of a kind that end its ``with`` block are left to the loop."""
 
-    def __init__(self, given: Given, caught: type[DeviceError]):
+    def __init__(self, given: Given, *caught: type[DeviceError]):
         self.given = given
         self._caught = caught
         self._error: DeviceError | None = None

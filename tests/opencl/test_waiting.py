@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from refusals import refused
 
-from clrecon.errors import DeviceFailedError, DeviceLostError, DeviceMemoryError, DeviceTimeoutError
+from clrecon.errors import DeviceFailedError, DeviceLostError, DeviceMemoryError, DeviceStoppedError, DeviceTimeoutError
 from clrecon.opencl import Stopwatch, allocate, download, launch, load_program, settle, upload, wait
 from clrecon.opencl import device as commands_module
 from clrecon.opencl.device import Commands, _Opened, has_hung_commands
@@ -108,7 +108,7 @@ def test_no_command_is_remembered_after_a_download(device):
     ("status", "kind", "name_of_status"),
     [
         (-4, DeviceMemoryError, "MEM_OBJECT_ALLOCATION_FAILURE"),
-        (-5, DeviceLostError, "OUT_OF_RESOURCES"),
+        (-5, DeviceStoppedError, "OUT_OF_RESOURCES"),
         (-36, DeviceLostError, "INVALID_COMMAND_QUEUE"),
         (-14, DeviceFailedError, "EXEC_STATUS_ERROR_FOR_EVENTS_IN_WAIT_LIST"),
     ],

@@ -40,9 +40,19 @@ def memory_error(code: int) -> Exception:
     return NoMemory(f"{cl.status_code.to_string(code)}: injected")
 
 
+class StoppedEvent:
+    """The event of a kernel that was accepted and then stopped."""
+
+    command_execution_status = -5  # OUT_OF_RESOURCES
+
+    def wait(self) -> None:
+        """Return at once."""
+
+
 class Failing:
     """Counts buffers and launches on a device, and lets some of one kind fail, from number `first` to `last`.
 
+    kind: "buffer", "launch", or "stop": kernels are launched and fail while they run.
     first, last: Numbers from 1; 0: none fails.
     label: Only of the device with this label; None: of all.
     error: That of launches; default: no memory.
@@ -60,7 +70,7 @@ class Failing:
     ):
         cl = import_pyopencl()
         self.kind, self.first, self.last = kind, first, first if last is None else last
-        self.counts = {"buffer": 0, "launch": 0}
+        self.counts = {"buffer": 0, "launch": 0, "stop": 0}
         self.sizes: list[int] = []
         true_buffer, true_enqueue = arrays._make_buffer, cl.Kernel.__call__
         contexts: dict[Any, str] = {}
@@ -75,7 +85,11 @@ class Failing:
         def call(kernel: Any, queue: Any, *arguments: Any, **options: Any) -> Any:
             if label in (None, contexts.get(queue.context)) and self._is_due("launch"):
                 raise cl.MemoryError("injected") if error is None else error
-            return true_enqueue(kernel, queue, *arguments, **options)
+            event = true_enqueue(kernel, queue, *arguments, **options)
+            if label in (None, contexts.get(queue.context)) and self._is_due("stop"):
+                event.wait()
+                return StoppedEvent()
+            return event
 
         monkeypatch.setattr(arrays, "_make_buffer", make_buffer)
         monkeypatch.setattr(cl.Kernel, "__call__", call)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 from numpy.typing import ArrayLike, NDArray
 
 from clrecon import opencl as ocl
-from clrecon.errors import DeviceMemoryError, UsageError
+from clrecon.errors import DeviceMemoryError, DeviceStoppedError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import ValueRange
 from clrecon.opencl import Attempt, Device, MemoryLimits, Program, Stopwatch
@@ -313,7 +313,8 @@ class DeviceVolume(Closing, Volume):
     def attempts(
         self, name: str, slices: int, warnings: list[str] | None = None, *, fewest: int = 1
     ) -> Iterator[Attempt[int]]:
-        """Yield attempts with ``slices`` in a slab, then with half as many as long as the device has no room.
+        """Yield attempts with ``slices`` in a slab, then with half as many as long as the device has no room, or is
+        stopped: by a watchdog, which counts the seconds of a kernel, or where memory was missing.
 
             for attempt in resident.attempts("surface", planned, warnings):
                 with attempt as slices:
@@ -327,7 +328,7 @@ class DeviceVolume(Closing, Volume):
         """
         is_last = False
         while True:
-            attempt = Attempt(slices, DeviceMemoryError)
+            attempt = Attempt(slices, DeviceMemoryError, DeviceStoppedError)
             yield attempt
             error = attempt.take_error()
             if error is None:

@@ -100,6 +100,24 @@ def test_work_whose_kernel_gets_no_memory_at_its_launch_is_done_in_slabs_and_say
     assert str(memory_error(code)) in warning
 
 
+@pytest.mark.parametrize("work", ["mip", "surface"])
+def test_work_whose_kernel_is_stopped_while_it_runs_is_the_same_in_slabs_of_half_and_says_so(
+    device, volume, monkeypatch, work
+):
+    """By a watchdog, or because the driver finds memory only then."""
+    do_work = {"mip": clrecon.render, "surface": clrecon.extract_isosurface}[work]
+    options = {"mip": {"style": "mip", "size": SIZE}, "surface": {"iso_value": 100}}[work]
+    expected = do_work(volume, device=device, **options)
+    Failing(monkeypatch, "stop", first=1)
+    found = do_work(volume, device=device, **options)
+    assert found.report["slabs"] == 2
+    (warning,) = (warning for warning in found.report["warnings"] if "continued with slabs of" in warning)
+    assert "OUT_OF_RESOURCES" in warning
+    arrays = ("values",) if work == "mip" else ("vertices", "normals", "triangles")
+    for array in arrays:
+        assert np.array_equal(getattr(found, array), getattr(expected, array), equal_nan=True)
+
+
 @pytest.mark.parametrize("work", WORK)
 def test_a_device_without_any_room_is_refused_and_holds_nothing(device, volume, labels, monkeypatch, work):
     with DeviceVolume(volume, device=device) as resident:
