@@ -18,6 +18,7 @@ import os
 import shutil
 import subprocess
 import sys
+import sysconfig
 import tarfile
 import tempfile
 import time
@@ -102,13 +103,22 @@ def use(installations: Iterable[Sequence[str]], commands: Iterable[str], folder:
 
 
 def pass_tests(archive: Path, paths: Sequence[str]) -> bool:
-    """Tell whether tests pass from an unpacked source distribution, with the packages of this environment."""
+    """Tell whether tests pass from unpacked sources that are installed beside the packages of this environment."""
     with tempfile.TemporaryDirectory() as temporary:
         with tarfile.open(archive) as opened:
             opened.extractall(temporary)
         (folder,) = Path(temporary).iterdir()
-        environment = {**os.environ, "PYTHONPATH": str(folder), "CLRECON_FAST_TESTS": "1"}
-        tests = [sys.executable, "-m", "pytest", "-q", "--assert=plain", "-p", "no:cacheprovider", *paths]
+        venv.create(Path(temporary, "environment"), with_pip=False)
+        python = Path(temporary, "environment", "Scripts" if os.name == "nt" else "bin", "python")
+        ask: list[str | Path] = [python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"]
+        site = Path(subprocess.run(ask, check=True, capture_output=True, text=True).stdout.strip())
+        # A folder named in a .pth file is searched, but the .pth files in it (an editable clrecon) are not read.
+        (site / "packages.pth").write_text("\n".join({sysconfig.get_path("purelib"), sysconfig.get_path("platlib")}))
+        install: list[str | Path] = [sys.executable, "-m", "pip", "--python", python, "install", "-q", "--no-deps"]
+        subprocess.run([*install, "--no-build-isolation", "--editable", folder], check=True, stdout=2)
+        environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+        environment["CLRECON_FAST_TESTS"] = "1"
+        tests: list[str | Path] = [python, "-m", "pytest", "-q", "--assert=plain", "-p", "no:cacheprovider", *paths]
         return subprocess.run(tests, cwd=folder, env=environment).returncode == 0
 
 

@@ -190,10 +190,12 @@ def test_warnings_of_libraries_are_not_shown_by_default() -> None:
         assert warnings.showwarning is not shows_warnings
 
 
-@pytest.mark.parametrize(("package", "name"), [(None, "no_such_module"), ("other-name", "other-name")])
-def test_missing_package_is_named_as_it_is_installed(package: str | None, name: str) -> None:
-    with refused(UsageError, name):
-        import_package("no_such_module", subject="a table", package=package)
+@pytest.mark.parametrize(
+    ("module", "package"), [("no_such_module", "no_such_module"), ("skimage.no_such_module", "scikit-image")]
+)
+def test_missing_package_is_named_as_it_is_installed(module: str, package: str) -> None:
+    with refused(UsageError, package):
+        import_package(module, "a table")
 
 
 def test_default_time_limit_of_a_device_is_ten_minutes() -> None:
