@@ -18,6 +18,9 @@
  * its triangles are marked, by atomic_or(), unless float32 shows that they do not cut each other: signs of volumes
  * and areas that exceed their rounding are those of exact arithmetic.
  *
+ * Triangles that have moved since are entered once more, behind all others, in levels of their own; these items look at
+ * all older levels, too.  What was entered before stays: a mark too many is found out by the exact look.
+ *
  * LANES entries are looked at together: boxes, and sides of both planes, which leave few pairs. */
 #include "include/lanes.h"
 
@@ -231,25 +234,29 @@ static inline ints not_apart(
     return left & (lie_apart(&there, spread(own->a), spread(own->b), spread(own->c), common) == 0);
 }
 
-/* Parameters  vertices   in   (vertices, 3) coordinates, of which the largest has a magnitude of 1024 to 2048
+/* Parameters  vertices   in   (vertices, 3) coordinates, of which the largest had a magnitude of 1024 to 2048
  *             triangles  in   (count, 3) their corners
  *             order      in   (count,) triangle of each entry
  *             places     out  (10, stride) coordinates of the corners of each entry, x y z of the first, of the second, of
  *                             the third; the lowest x
  *             names      out  (3, stride) corners of each entry
- * Launch      global = stride rounded up by the host, any local
- * Guarantees  entries from count on lie at infinity */
+ *             marks  in and out  (stride + 31 / 32,) bits of entries
+ *             first items   the entries that are written
+ * Launch      global = items rounded up by the host, any local
+ * Guarantees  entries from first + count on lie at infinity; a bit is set for each triangle without area.
+ *             Races: marks by atomic_or() alone */
 __kernel void enter_triangles(
     __global const float *restrict vertices, __global const uint *restrict triangles, __global const uint *restrict order,
-    __global float *restrict places, __global uint *restrict names, const uint count, const uint stride)
+    __global float *restrict places, __global uint *restrict names, __global uint *restrict marks, const uint first,
+    const uint items, const uint count, const uint stride)
 {
-    const uint entry = get_global_id(0);
-    if (entry >= stride)
+    const uint item = get_global_id(0), entry = first + item;
+    if (item >= items)
         return;
     float low = INFINITY;
     for (uint corner = 0; corner < 3; ++corner) {
-        const uint name = entry < count ? triangles[3 * (size_t)order[entry] + corner] : 0;
-        const float3 at = entry < count ? vload3(name, vertices) : (float3)(INFINITY);
+        const uint name = item < count ? triangles[3 * (size_t)order[item] + corner] : 0;
+        const float3 at = item < count ? vload3(name, vertices) : (float3)(INFINITY);
         names[(size_t)corner * stride + entry] = name;
         __global float *row = places + 3 * (size_t)corner * stride + entry;
         row[0] = at.x;
@@ -258,24 +265,31 @@ __kernel void enter_triangles(
         low = fmin(low, at.x);
     }
     places[9 * (size_t)stride + entry] = low;
+    if (item >= count)
+        return;
+    const triangle own = triangle_at(places, names, stride, entry);
+    const plane flat = plane_of(own.a, own.b, own.c);
+    const int3 has_area = fabs(flat.normal) > ROUNDING * flat.terms;
+    if (!(has_area.x || has_area.y || has_area.z))
+        atomic_or(&marks[entry / 32u], 1u << entry % 32u);
 }
 
 /* Parameters  places names  in   (10, stride), (3, stride) see enter_triangles
  *             starts    in   (rows + 1,) first entry of each row; those of a level side by side, z * ny + y
  *             levels    in   (levels, 4) first row, rows along y, rows along z, and the end of the entries of each level
- *             edges     in   (levels, 2) width of the rows, ascending, and longest side of the boxes
- *             origin_y origin_z   lowest corner of all boxes
- *             marks     in and out  (n + 31 / 32,) bits of entries
- *             first items   the entries of this launch;  level_count: levels;  stride: at least n + LANES
+ *             edges     in   (levels, 4) width of the rows, longest side of the boxes, y and z that rows are counted from
+ *             marks     in and out  (stride + 31 / 32,) bits of entries
+ *             first items   the entries of this launch;  level_count: levels;  older: levels of entries that were entered
+ *                            before these;  stride: at least n + LANES
  * Launch      global = items rounded up by the host, any local
  * Assumes     entries in the order of level, row and low x; at most 4096 rows along an axis
- * Guarantees  a bit is set for both triangles of each pair that cuts each other; bits are only added.
+ * Guarantees  a bit is set for both triangles of each pair that touch each other beside common corners and have one of
+ *             these entries; bits are only added.
  *             Races: marks by atomic_or() alone */
 __kernel void mark_crossings(
     __global const float *restrict places, __global const uint *restrict names, __global const uint *restrict starts,
     __global const uint *restrict levels, __global const float *restrict edges, __global uint *restrict marks,
-    const float origin_y, const float origin_z, const uint first, const uint items, const uint level_count,
-    const uint stride)
+    const uint first, const uint items, const uint level_count, const uint older, const uint stride)
 {
     if (get_global_id(0) >= items)
         return;
@@ -284,15 +298,16 @@ __kernel void mark_crossings(
     const triangle own = triangle_at(places, names, stride, entry);
     const float3 begin = fmin(fmin(own.a, own.b), own.c), end = fmax(fmax(own.a, own.b), own.c);
     const plane flat = plane_of(own.a, own.b, own.c);
-    uint own_level = 0;
+    uint own_level = older;
     while (entry >= levels[4 * own_level + 3])
         ++own_level;
-    for (uint level = own_level > 0 ? own_level - 1 : 0; level < level_count; ++level) {
-        if (level == own_level + 1)
-            continue; /* its triangles look here */
+    for (uint level = 0; level < level_count; ++level) {
+        if (level >= older && (level + 1 < own_level || level == own_level + 1))
+            continue; /* their triangles look here */
         const uint first_row = levels[4 * level];
         const int ny = (int)levels[4 * level + 1], nz = (int)levels[4 * level + 2];
-        const float per_edge = 1.0f / edges[2 * level], reach = (1.0f + SLACK) * edges[2 * level + 1];
+        const float per_edge = 1.0f / edges[4 * level], reach = (1.0f + SLACK) * edges[4 * level + 1];
+        const float origin_y = edges[4 * level + 2], origin_z = edges[4 * level + 3];
         const float from_y = (begin.y - reach - origin_y) * per_edge;
         const float from_z = (begin.z - (level == own_level ? 0.0f : reach) - origin_z) * per_edge;
         const int y0 = max((int)floor(from_y - SLACK), 0);

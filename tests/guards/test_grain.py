@@ -12,7 +12,7 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 101_139,
+    "lines": 101_238,
     "modules": 440,
     "small_modules_with_one_reader": 8,
     "docstrings_with_raises": 139,

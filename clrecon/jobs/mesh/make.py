@@ -175,12 +175,12 @@ def _try_cortex(device: Device, mesh: Mesh) -> None:
     from clrecon.opencl import Stopwatch
     from clrecon.operators.resident.device_volume import DeviceVolume
     from clrecon.operators.surface.cortex import ProfileSampler
-    from clrecon.operators.surface.decimation import mark_crossings, plan_crossings
+    from clrecon.operators.surface.decimation import CrossingMarks, plan_crossings
 
     with suppress(DeviceFailedError), DeviceVolume(trial_cube(), device=device.current) as resident:
         sampler = ProfileSampler(resident, Stopwatch())
         sampler.take(sampler.values(mesh.vertices, mesh.vertices)).fit(0.7, 0.7, 1000.0, 20.0)
-        mark_crossings(device.current, plan_crossings(mesh.vertices, mesh.triangles))
+        CrossingMarks(device.current, plan_crossings(mesh.vertices, mesh.triangles)).look()
 
 
 def _try_labels(device: Device, choice: LabelChoice) -> list[Mesh]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +47,21 @@ def enclosed_mm3(
     return six_volumes / 6.0
 
 
+class Marks(Protocol):
+    """Triangles of a surface, and of it changed, among which are all that touch another one, or have no area."""
+
+    def look(self) -> IntArray: ...
+    def look_again(self, vertices: NDArray[np.float32], changed: IntArray, /) -> IntArray: ...
+
+
+Follow = Callable[[NDArray[np.floating], NDArray[np.uint32]], Marks | None]
+"""Returns marks of a surface before its vertices are moved; None where nothing marks."""
+
+
+def follow_none(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> None:
+    """Return no marks: all triangles are looked at, and then what lies near to changed ones."""
+
+
 def move_vertices(
     vertices: NDArray[np.floating],
     triangles: NDArray[np.uint32],
@@ -53,12 +69,13 @@ def move_vertices(
     find_crossings: FindCrossings = find_self_intersections,
     find_changed: Callable[[NDArray[np.floating], Float64Array], IntArray] | None = None,
     fans: Fans | None = None,
-    look_at: NDArray[np.bool_] | None = None,
+    follow: Follow = follow_none,
 ) -> tuple[NDArray[np.floating], int]:
     """Move vertices, but by less or not at all where triangles would cut, lose their area or share a place.
 
-    All triangles, or those of `look_at`, are looked at once, and then those around what is taken back.
+    All triangles are looked at once, and then those around what is taken back.
 
+    follow: Where it returns marks of a surface, only the triangles that these name are looked at.
     find_changed: Given places and the share of each step that is made, finds vertices that are not to move at all.
     Returns:
     vertices: As stored.  Faults that existed before may remain.
@@ -66,12 +83,17 @@ def move_vertices(
     """
     share = np.ones(len(vertices))
     moved = as_stored(vertices + step)
-    look_at = np.ones(len(triangles), dtype=bool) if look_at is None else look_at
-    spoilt: IntArray = _find_spoilt(moved, triangles, look_at, find_crossings)
+    marks = follow(moved, triangles)
+    changed = np.ones(len(triangles), dtype=bool)
+    spoilt: IntArray = (
+        _find_spoilt(moved, triangles, changed, find_crossings)
+        if marks is None
+        else _find_spoilt_among(marks.look(), moved, triangles, changed)
+    )
     near: _Near | None = None
     for turn in range(_ROUNDS):
-        if turn >= _ROUNDS_OF_ITS_OWN and near is not None:
-            spoilt = find_used(triangles[near.fans.touching(spoilt)], len(vertices))
+        if turn >= _ROUNDS_OF_ITS_OWN and fans is not None:
+            spoilt = find_used(triangles[fans.touching(spoilt)], len(vertices))
         spoilt = spoilt[share[spoilt] > 0.0]
         if len(spoilt):
             share[spoilt] *= 0.5
@@ -82,20 +104,24 @@ def move_vertices(
             share[spoilt] = 0.0
         if len(spoilt) == 0:
             break
-        near = near or _Near(vertices, moved, triangles, fans or Fans(triangles, len(moved)))
+        fans = fans or Fans(triangles, len(moved))
         moved[spoilt] = vertices[spoilt] + share[spoilt, None] * step[spoilt]
-        spoilt = near.find_spoilt(spoilt, find_crossings)
+        rows = fans.touching(spoilt)
+        changed = np.zeros(len(triangles), dtype=bool)
+        changed[rows] = True
+        if marks is None:
+            near = near or _Near(vertices, moved, triangles)
+            spoilt = near.find_spoilt(changed, find_crossings)
+        else:
+            spoilt = _find_spoilt_among(marks.look_again(moved, rows), moved, triangles, changed)
     return moved, int(np.count_nonzero(share < 1.0))
 
 
 class _Near:
     """Search for what is spoilt around vertices that were taken back, from `moved` towards `vertices`, in mm."""
 
-    def __init__(
-        self, vertices: NDArray[np.floating], moved: NDArray[np.floating], triangles: NDArray[np.uint32], fans: Fans
-    ):
+    def __init__(self, vertices: NDArray[np.floating], moved: NDArray[np.floating], triangles: NDArray[np.uint32]):
         self._moved, self._triangles = moved, triangles
-        self.fans = fans
         low, high = np.minimum(vertices, moved), np.maximum(vertices, moved)
         start, end = find_bounds(low)
         size = float(np.cbrt(np.prod(end - start + 1e-3) / (_CELL_SHARE * len(triangles))))
@@ -107,16 +133,28 @@ class _Near:
         self._low = np.minimum.reduceat(find_boxes(low, rows)[0], starts)
         self._high = np.maximum.reduceat(find_boxes(high, rows)[1], starts)
 
-    def find_spoilt(self, vertices: IntArray, find_crossings: FindCrossings) -> IntArray:
-        """Find the vertices of spoilt triangles after these vertices went back."""
-        moved, changed = self._moved, np.zeros(len(self._triangles), dtype=bool)
-        changed[self.fans.touching(vertices)] = True
+    def find_spoilt(self, changed: NDArray[np.bool_], find_crossings: FindCrossings) -> IntArray:
+        """Find the vertices of spoilt triangles after these triangles have changed."""
+        moved = self._moved
         boxes = find_boxes(moved, self._triangles[changed])
         pieces = find_boxes_beside(self._low, self._high, *boxes)
         rows = np.sort(self._order[np.repeat(pieces, _IN_A_BLOCK)[: len(changed)]])
         rows = rows[find_beside(moved, self._triangles[rows], changed[rows])]
-        used, corners = number_used(self._triangles[rows], len(moved))
-        return used[_find_spoilt(moved[used], corners, changed[rows], find_crossings)]
+        return _find_spoilt_among(rows, moved, self._triangles, changed, find_crossings)
+
+
+def _find_spoilt_among(
+    rows: IntArray,
+    vertices: NDArray[np.floating],
+    triangles: NDArray[np.uint32],
+    changed: NDArray[np.bool_],
+    find_crossings: FindCrossings = find_self_intersections,
+) -> IntArray:
+    """Do what `_find_spoilt` does among some rows of the triangles."""
+    if len(rows) == 0:
+        return rows
+    used, corners = number_used(triangles[rows], len(vertices))
+    return used[_find_spoilt(vertices[used], corners, changed[rows], find_crossings)]
 
 
 def _find_spoilt(

@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 from clrecon.errors import UsageError
 from clrecon.exchange.coordinates import rounding_step
 from clrecon.mesh.connectivity import label_components, order_by_number
-from clrecon.mesh.intersections import FindCrossings, find_self_intersections
 from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.refine.decimation import carry_on, check_refinement
-from clrecon.mesh.refine.shifts import move_vertices
+from clrecon.mesh.refine.shifts import Follow, follow_none, move_vertices
 from clrecon.mesh.triangles import cross_product, vertex_normals
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.pieces import in_threads, local_origin
@@ -329,11 +328,11 @@ def smooth_mesh(
     *,
     progress: Progress | None = None,
     make_filter: MakeFilter = Filter,
-    find_crossings: FindCrossings = find_self_intersections,
+    follow: Follow = follow_none,
 ) -> Mesh:
     """Smooth a surface, see `clrecon.operators.surface.smoothing.smooth_mesh`.
 
-    make_filter, find_crossings: `Filter` and `find_self_intersections`, or what does the same elsewhere.
+    make_filter, follow: `Filter`, or what does the same elsewhere, and the marks of `move_vertices`.
     """
     if isinstance(iterations, float) or not 1 <= iterations <= 1000:
         raise UsageError(f"smoothing takes from 1 to 1000 iterations, not {iterations}")
@@ -359,8 +358,8 @@ def smooth_mesh(
     steps, held_back, left = components.keep_volumes(wanted, longest)
     progress("smooth", 2, 3)
     vertices, taken_back = move_vertices(
-        mesh.vertices, mesh.triangles, steps, find_crossings,
-        lambda now, made: components.find_changed(now - origin, made),
+        mesh.vertices, mesh.triangles, steps, follow=follow,
+        find_changed=lambda now, made: components.find_changed(now - origin, made),
     )  # fmt: skip
     progress("smooth", 3, 3)
     facts = {

@@ -409,7 +409,7 @@ def fit_mesh(
     mesh: Mesh, resident: DeviceVolume, constants: CortexConstants | None, progress: Progress = ignore_progress
 ) -> Mesh:
     """Do what `fit_cortex` does, with constants of the scan that are known."""
-    from clrecon.operators.surface.decimation import find_crossings
+    from clrecon.operators.surface.decimation import follow_crossings
 
     steps = Steps(progress, "cortex", 4)
     _refuse_few(mesh.vertex_count, mesh.vertex_count)
@@ -429,8 +429,9 @@ def fit_mesh(
         wanted, calm = _place_vertices(fit, mesh, normals, fans)
     steps.take()
     vertices, _ = move_vertices(
-        mesh.vertices, mesh.triangles, calm - mesh.vertices, partial(find_crossings, resident.device), fans=fans
-    )
+        mesh.vertices, mesh.triangles, calm - mesh.vertices, fans=fans,
+        follow=partial(follow_crossings, resident.device),
+    )  # fmt: skip
     steps.take()
     fitted = fit.states == FITTED
     unmoved = int(np.count_nonzero(fitted & (np.abs(vertices - wanted).max(axis=1) > KEPT_MM)))

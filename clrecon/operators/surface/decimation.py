@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from clrecon import opencl as ocl
 from clrecon.mesh import Mesh
-from clrecon.mesh.connectivity import number_used
+from clrecon.mesh.connectivity import find_used, number_used
 from clrecon.mesh.intersections import find_boxes, find_self_intersections
 from clrecon.mesh.refine import decimation
 from clrecon.opencl import Device
@@ -38,22 +38,23 @@ _PIECE = 1 << 17
 """Triangles of a launch; progress is reported between launches."""
 
 Float32Array = NDArray[np.float32]
+IntArray = NDArray[np.integer]
 
 
 @dataclass(frozen=True)
 class CrossingPlan:
     """Triangles in the rows of levels, as the kernel reads them.
 
-    vertices: ndarray, shape (v, 3), float32. Scaled by a power of two, which changes no digit.
+    vertices: ndarray, shape (v, 3), float32. Scaled by two to the power of `exponent`, which changes no digit.
     triangles, order: ndarray, shapes (n, 3) and (n,), uint32. Of the order: the triangle of each entry.
     starts: ndarray, uint32. First entry of each row, and the number of entries.
-    levels, edges: ndarray, shape (levels, 4) uint32, (levels,) float32
+    levels, edges: ndarray, shape (levels, 4) uint32, (levels, 4) float32
     """
 
     vertices: Float32Array
+    exponent: int
     triangles: NDArray[np.uint32]
     order: NDArray[np.uint32]
-    origin: Float32Array
     starts: NDArray[np.uint32]
     levels: NDArray[np.uint32]
     edges: Float32Array
@@ -71,7 +72,13 @@ def plan_crossings(
     vertices: Float32Array, triangles: NDArray[np.uint32], *, most_rows: int = _MOST_ROWS
 ) -> CrossingPlan:
     """Enter at least one triangle into rows."""
-    scaled = np.ldexp(vertices, 11 - int(np.frexp(np.abs(vertices).max())[1]))
+    exponent = 11 - int(np.frexp(np.abs(vertices).max())[1])
+    return _enter_into_rows(np.ldexp(vertices, exponent), exponent, triangles, most_rows)
+
+
+def _enter_into_rows(
+    scaled: Float32Array, exponent: int, triangles: NDArray[np.uint32], most_rows: int = _MOST_ROWS
+) -> CrossingPlan:
     low, high = (np.ascontiguousarray(corner.T) for corner in find_boxes(scaled, triangles))
     high -= low
     longest = np.maximum(np.maximum(high[0], high[1]), high[2])
@@ -96,38 +103,85 @@ def plan_crossings(
     order = np.argsort(row << 32 | np.where(bits < 0, ~bits, bits ^ np.int32(-(2**31))).view(np.uint32))
     starts = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=first_row[-1]))]).astype(np.uint32)
     levels = np.column_stack([first_row[:-1], size, starts[first_row[1:]]]).astype(np.uint32)
-    table = np.column_stack([edges, longest_of]).astype(np.float32)
-    return CrossingPlan(scaled, triangles, order.astype(np.uint32), origin.astype(np.float32), starts, levels, table)
+    table = np.column_stack([edges, longest_of, *(np.full(len(edges), at) for at in origin[1:])]).astype(np.float32)
+    return CrossingPlan(scaled, exponent, triangles, order.astype(np.uint32), starts, levels, table)
 
 
-def mark_crossings(
-    device: Device, plan: CrossingPlan, *, piece: int = _PIECE, steps: Steps | None = None
-) -> NDArray[np.bool_]:
-    """Mark the triangles that may cut another one, shape (n,), in the order of the mesh."""
-    count = len(plan.order)
-    program = ocl.load_program(device, "surface/crossings.cl", {"LANES": device.kernel_variants["LANES"]})
-    places_d, names_d = (ocl.allocate(device, 4 * rows * plan.stride) for rows in (10, 3))
-    ocl.launch(
-        device, program["enter_triangles"], plan.stride, vertices=ocl.upload(device, plan.vertices),
-        triangles=ocl.upload(device, plan.triangles), order=ocl.upload(device, plan.order), places=places_d,
-        names=names_d, count=count, stride=plan.stride,
-    )  # fmt: skip
-    marks_d = zero_words(device, (count + 31) // 32)
-    starts_d, levels_d, edges_d = (ocl.upload(device, table) for table in (plan.starts, plan.levels, plan.edges))
-    for first in range(0, count, piece):
-        items = min(piece, count - first)
+class CrossingMarks:
+    """Triangles of a surface that may cut another one, marked on a device: of a plan, and of what has changed since.
+
+    spare: Most triangles that are entered after those of the plan.
+    """
+
+    def __init__(self, device: Device, plan: CrossingPlan, *, spare: int = 0):
+        self._device = device
+        self._program = ocl.load_program(device, "surface/crossings.cl", {"LANES": device.kernel_variants["LANES"]})
+        self._stride = plan.stride + spare
+        self._places_d, self._names_d = (ocl.allocate(device, 4 * rows * self._stride) for rows in (10, 3))
+        self._forget(plan)
+
+    def _forget(self, plan: CrossingPlan) -> None:
+        self._plan = plan
+        self._rows = self._starts = np.zeros(0, np.uint32)
+        self._levels, self._edges = np.zeros((0, 4), np.uint32), np.zeros((0, 4), np.float32)
+
+    def look(self, *, piece: int = _PIECE, steps: Steps | None = None) -> IntArray:
+        """Return the triangles of the plan without area, and those that may cut another one."""
+        return self._mark(self._plan, self._plan.order, piece=piece, steps=steps)
+
+    def look_again(self, vertices: Float32Array, changed: IntArray) -> IntArray:
+        """Return the same of triangles that have changed, and what they may cut; of all where there is no room left."""
+        plan, triangles = self._plan, self._plan.triangles[changed]
+        if len(self._rows) + len(changed) + _MOST_LANES > self._stride:
+            self._forget(plan_crossings(vertices, plan.triangles))
+            return self.look()
+        used = find_used(triangles, len(vertices))
+        plan.vertices[used] = np.ldexp(vertices[used], plan.exponent)
+        again = _enter_into_rows(plan.vertices, plan.exponent, triangles)
+        return self._mark(again, changed.astype(np.uint32)[again.order])
+
+    def _mark(
+        self, plan: CrossingPlan, rows: NDArray[np.uint32], *, piece: int = _PIECE, steps: Steps | None = None
+    ) -> IntArray:
+        device = self._device
+        first, older = len(self._rows), len(self._edges)
+        levels = plan.levels + np.array([len(self._starts), 0, 0, first], np.uint32)
+        self._starts = np.concatenate([self._starts, plan.starts + np.uint32(first)])
+        self._levels, self._edges = np.vstack([self._levels, levels]), np.vstack([self._edges, plan.edges])
+        self._rows = np.concatenate([self._rows, rows])
+        tables = {"starts": self._starts, "levels": self._levels, "edges": self._edges}
+        tables_d = {name: ocl.upload(device, table) for name, table in tables.items()}
+        marks_d = zero_words(device, (self._stride + 31) // 32)
+        shared = {"places": self._places_d, "names": self._names_d, "marks": marks_d, "stride": self._stride}
         ocl.launch(
-            device, program["mark_crossings"], items, places=places_d, names=names_d, starts=starts_d, levels=levels_d,
-            edges=edges_d, marks=marks_d, origin_y=plan.origin[1], origin_z=plan.origin[2], first=first, items=items,
-            level_count=len(plan.edges), stride=plan.stride,
+            device, self._program["enter_triangles"], plan.stride, vertices=ocl.upload(device, plan.vertices),
+            triangles=ocl.upload(device, plan.triangles), order=ocl.upload(device, plan.order), **shared,
+            first=first, items=plan.stride, count=len(rows),
         )  # fmt: skip
-        if steps is not None:
-            ocl.wait(device)
-            steps.take(items)
-    words = ocl.download(device, np.empty((count + 31) // 32, np.uint32), marks_d)
-    marked = np.zeros(count, bool)
-    marked[plan.order] = np.unpackbits(words.view(np.uint8), bitorder="little")[:count].view(bool)
-    return marked
+        for begin in range(first, len(self._rows), piece):
+            items = min(piece, len(self._rows) - begin)
+            ocl.launch(
+                device, self._program["mark_crossings"], items, **shared, **tables_d, first=begin, items=items,
+                level_count=len(self._edges), older=older,
+            )  # fmt: skip
+            if steps is not None:
+                ocl.wait(device)
+                steps.take(items)
+        words = ocl.download(device, np.empty((self._stride + 31) // 32, np.uint32), marks_d)
+        entries = np.flatnonzero(np.unpackbits(words.view(np.uint8), bitorder="little"))
+        return find_used(self._rows[entries], len(self._plan.order))
+
+
+def follow_crossings(
+    device: Device, vertices: NDArray[np.floating], triangles: NDArray[np.uint32], *, fewest: int = _FEWEST
+) -> CrossingMarks | None:
+    """Return marks of triangles of a surface that is about to change; None where `find_crossings` asks the host."""
+    if len(triangles) < fewest or vertices.dtype != np.float32:
+        return None
+    plan = plan_crossings(vertices, triangles)
+    spare = len(triangles) // 8
+    needs = {**plan.needs(), "changed triangles": 52 * spare}
+    return None if ocl.describe_shortage(ocl.memory_limits(device), needs) else CrossingMarks(device, plan, spare=spare)
 
 
 def find_crossings(
@@ -151,7 +205,7 @@ def find_crossings(
     plan = plan_crossings(vertices, triangles)
     if ocl.describe_shortage(ocl.memory_limits(device, memory), plan.needs()):
         return find_self_intersections(vertices, triangles, changed, steps=steps)
-    marked = np.flatnonzero(mark_crossings(device, plan, steps=steps))
+    marked = CrossingMarks(device, plan).look(steps=steps).astype(np.int64)
     used, corners = number_used(triangles[marked], len(vertices))
     return marked[find_self_intersections(vertices[used], corners, None if changed is None else changed[marked])]
 

@@ -16,7 +16,7 @@ from clrecon.mesh.refine.smoothing import Filter, Rings, Term
 from clrecon.opencl import Device, Program
 from clrecon.operators.masks.voxel_mask import zero_words
 from clrecon.operators.primitives.union_find import label_components
-from clrecon.operators.surface.decimation import find_crossings
+from clrecon.operators.surface.decimation import follow_crossings
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress
 
@@ -135,6 +135,6 @@ def smooth_mesh(
         with attempt as (current, _):
             smooth = smoothing.smooth_mesh(
                 mesh, iterations, max_deviation_mm, progress=progress, make_filter=partial(DeviceFilter, current),
-                find_crossings=partial(find_crossings, current),
+                follow=partial(follow_crossings, current),
             )  # fmt: skip
     return smooth

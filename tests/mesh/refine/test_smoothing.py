@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 import sample_meshes as samples
@@ -25,6 +27,7 @@ from clrecon.mesh.refine.shifts import (
 )
 from clrecon.mesh.refine.smoothing import Filter, Rings, sinc_terms, smooth_mesh
 from clrecon.mesh.triangles import vertex_normals
+from clrecon.operators.surface.decimation import follow_crossings
 
 pytestmark = pytest.mark.unit
 
@@ -323,6 +326,24 @@ def test_steps_are_taken_back_as_if_all_triangles_were_looked_at_after_each_roun
     expected, count = move_by_looking_at_all(vertices, triangles, step)
     np.testing.assert_array_equal(moved, expected)
     assert taken_back == count > 1000  # of 12,294 vertices; measured 2,700 and more
+
+
+def test_steps_are_taken_back_alike_where_a_device_marks_what_is_looked_at(shells_with_wild_steps, device):
+    vertices, triangles, step = shells_with_wild_steps
+    follow = partial(follow_crossings, device, fewest=1)
+    moved, taken_back = move_vertices(vertices, triangles, step, follow=follow)
+    expected, count = move_vertices(vertices, triangles, step)
+    np.testing.assert_array_equal(moved, expected)
+    assert taken_back == count
+
+
+def test_steps_of_a_surface_of_which_a_device_marks_nothing_are_made(device):
+    vertices, triangles = samples.torus(rings=20, sides=10)
+    vertices, triangles = vertices.astype(np.float32), np.asarray(triangles, np.uint32)
+    follow = partial(follow_crossings, device, fewest=1)
+    moved, taken_back = move_vertices(vertices, triangles, np.full(vertices.shape, 0.5), follow=follow)
+    np.testing.assert_array_equal(moved, (vertices + 0.5).astype(np.float32))
+    assert taken_back == 0
 
 
 def test_rounds_after_the_second_look_at_less_than_half_and_the_last_at_a_twentieth_of_the_triangles(

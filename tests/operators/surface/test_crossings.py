@@ -10,7 +10,7 @@ from variants import daily
 from clrecon.errors import Cancelled
 from clrecon.mesh.intersections import find_self_intersections
 from clrecon.operators.surface import decimation
-from clrecon.operators.surface.decimation import find_crossings, mark_crossings, plan_crossings
+from clrecon.operators.surface.decimation import CrossingMarks, find_crossings, follow_crossings, plan_crossings
 from clrecon.proof.surface import crossings as twin
 from clrecon.system.progress import Steps
 
@@ -27,6 +27,10 @@ def scattered(count: int, sizes=(0.3, 1.0, 6.0), seed: int = 5, extent=(30.0, 30
     return corners.reshape(-1, 3).astype(np.float32), triangles
 
 
+def marked(device, vertices, triangles, **options):
+    return CrossingMarks(device, plan_crossings(vertices, triangles)).look(**options)
+
+
 def pairs(found) -> set[tuple[int, int]]:
     return {(int(min(pair)), int(max(pair))) for pair in found}
 
@@ -35,8 +39,8 @@ def pairs(found) -> set[tuple[int, int]]:
 @pytest.mark.parametrize("count", [1, 2, 31, 32, 33, 200])
 def test_crossing_triangles_are_marked_as_by_the_twin(device, count):
     vertices, triangles = scattered(count, sizes=(0.3, 1.0, 5.0))
-    found = mark_crossings(device, plan_crossings(vertices, triangles))
-    assert np.array_equal(found, twin.mark_crossings(vertices, triangles))
+    expected = np.flatnonzero(twin.mark_crossings(vertices, triangles))
+    assert np.array_equal(marked(device, vertices, triangles), expected)
 
 
 MANY_SMALL_TRIANGLES = (*[0.1] * 60, 6.0)  # mm
@@ -44,7 +48,7 @@ MANY_SMALL_TRIANGLES = (*[0.1] * 60, 6.0)  # mm
 
 def test_edges_of_levels_double_and_hold_the_longest_side_of_their_triangles():
     plan = plan_crossings(*scattered(700, sizes=MANY_SMALL_TRIANGLES), most_rows=100)
-    edges, longest = plan.edges.T
+    edges, longest = plan.edges.T[:2]
     assert len(edges) == len(plan.levels) > 1
     np.testing.assert_allclose(edges, edges[0] * 2.0 ** np.arange(len(edges)), rtol=1e-6)  # float32
     assert (longest <= edges).all()
@@ -59,9 +63,9 @@ def test_finest_level_has_no_more_rows_than_allowed_and_more_than_half_of_them()
 @pytest.mark.oclgrind
 def test_crossing_triangles_of_a_small_body_are_marked_as_by_the_twin(device):
     vertices, triangles = scattered(150, extent=(8.0, 8.0, 8.0))
-    found = mark_crossings(device, plan_crossings(vertices, triangles))
-    assert found.any()
-    assert np.array_equal(found, twin.mark_crossings(vertices, triangles))
+    found = marked(device, vertices, triangles)
+    assert len(found) > 0
+    assert np.array_equal(found, np.flatnonzero(twin.mark_crossings(vertices, triangles)))
 
 
 @pytest.mark.parametrize("sizes", [(0.01, 1.0, 40.0), (1.0,), (0.02, 0.021)])
@@ -107,8 +111,40 @@ def test_two_spheres_that_cut_each_other_have_crossing_pairs(device):
 def test_no_triangle_of_a_torus_is_marked(device):
     """Neighbours share vertices, and what lies farther is told apart in float32."""
     vertices, triangles = samples.torus(rings=120, sides=60)
-    found = mark_crossings(device, plan_crossings(vertices.astype(np.float32), np.asarray(triangles, np.uint32)))
-    assert not found.any()
+    assert len(marked(device, vertices.astype(np.float32), np.asarray(triangles, np.uint32))) == 0
+
+
+@pytest.mark.every_device
+def test_triangles_without_area_are_marked(device):
+    vertices, triangles = samples.torus(rings=20, sides=10)
+    vertices, triangles = vertices.astype(np.float32), np.asarray(triangles, np.uint32)
+    vertices[triangles[7, 1]] = vertices[triangles[7, 0]]
+    assert 7 in marked(device, vertices, triangles)
+
+
+@pytest.mark.every_device
+@pytest.mark.parametrize("sizes", [(0.3, 1.0, 6.0), (1.0,), (0.02, 40.0)])
+def test_changed_triangles_and_what_they_cut_are_marked_after_each_change(device, sizes):
+    vertices, triangles = scattered(900, sizes)
+    marks = follow_crossings(device, vertices, triangles, fewest=1)
+    marks.look()
+    random = np.random.default_rng(2)
+    for count in (20, 10):  # of 2,700 corners: 45 and 25 triangles
+        corners = random.choice(len(vertices), count, replace=False)
+        vertices[corners] += random.normal(0.0, 3.0, (count, 3)).astype(np.float32)
+        is_changed = np.isin(triangles, corners).any(axis=1)
+        rows = marks.look_again(vertices, np.flatnonzero(is_changed))
+        expected = pairs(find_self_intersections(vertices, triangles, is_changed))
+        assert len(expected) > 0
+        assert pairs(rows[find_self_intersections(vertices, triangles[rows], is_changed[rows])]) == expected
+
+
+def test_change_of_more_triangles_than_there_is_room_for_is_looked_at_anew(device):
+    vertices, triangles = scattered(400)
+    marks = CrossingMarks(device, plan_crossings(vertices, triangles))
+    marks.look()
+    moved = vertices[::-1].copy()
+    assert np.array_equal(marks.look_again(moved, np.arange(400)), marked(device, moved, triangles))
 
 
 def test_a_triangle_without_area_crosses_nothing(device):
@@ -130,7 +166,7 @@ def test_crossings_among_triangles_without_area_are_those_of_the_host(device):
     ids=["too few", "float64", "no room"],
 )
 def test_triangles_that_the_device_does_not_take_have_the_crossings_of_the_host(device, dtype, options, monkeypatch):
-    monkeypatch.setattr(decimation, "mark_crossings", None)
+    monkeypatch.setattr(decimation, "CrossingMarks", None)
     vertices, triangles = scattered(600)
     told: list[tuple[str, int, int]] = []
     steps = Steps(lambda *step: told.append(step), "crossings", 600)
@@ -144,7 +180,7 @@ def test_triangles_that_the_device_does_not_take_have_the_crossings_of_the_host(
 def test_progress_of_crossings_is_told_after_each_piece(device):
     told: list[int] = []
     steps = Steps(lambda *step: told.append(step[1]), "crossings", 600)
-    mark_crossings(device, plan_crossings(*scattered(600)), piece=256, steps=steps)
+    marked(device, *scattered(600), piece=256, steps=steps)
     assert told == [0, 256, 512, 600]
 
 
@@ -154,7 +190,7 @@ def test_progress_of_crossings_may_end_the_work(device):
             raise Cancelled("enough")
 
     with pytest.raises(Cancelled, match="enough"):
-        mark_crossings(device, plan_crossings(*scattered(600)), piece=256, steps=Steps(cancel, "crossings", 600))
+        marked(device, *scattered(600), piece=256, steps=Steps(cancel, "crossings", 600))
 
 
 def test_progress_of_crossings_counts_all_triangles_of_one_piece_at_once(device):
