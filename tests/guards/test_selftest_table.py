@@ -19,6 +19,7 @@ from kernel_mutations import EQUIVALENT, INVERSIONS, Mutation, all_mutations, fi
 
 OF_TYPES = {"VOXEL", "VALUE", "LABEL", "VOXEL_IS_SHORT"}
 OF_DEVICES = {"LANES", "WORDS_PER_ITEM", "HAS_BUILTIN_PREFETCH", "SCAN_GROUP", "NO_WINDOWS", "CPU_NAME", "ATOMIC_LOADS"}
+OF_DEVICES |= {"HAS_WIDE_LANES", "TAKES_WIDE_LANES"}  # the second is defined by files that ask for the first
 OF_COMPILERS = re.compile(r"__\w+__|CLRECON_\w+_H")
 """Macros that a check need not name: it runs with several types, and with what its device is given."""
 
