@@ -12,9 +12,9 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 101_238,
+    "lines": 101_258,
     "modules": 440,
-    "small_modules_with_one_reader": 8,
+    "small_modules_with_one_reader": 7,
     "docstrings_with_raises": 139,
     "options_in_several_files": 8,
     "modules_with_own_all": 0,

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 from clrecon.errors import UsageError
 from clrecon.exchange.formats import check_assembly, check_in_pieces, describe_rounding
 from clrecon.geometry import frame_from_lps
-from clrecon.jobs.devices import list_usable
 from clrecon.jobs.mesh.bone import judge_surfaces, warn_of_walls
 from clrecon.jobs.mesh.labels import describe_label, judge_label_volumes, name_label_files
 from clrecon.jobs.mesh.make import MadeParts, first_names, label_parts, make_parts, warn_of_crumbs
@@ -36,6 +35,7 @@ if TYPE_CHECKING:
     from clrecon.mesh import Mesh
     from clrecon.opencl import Device
     from clrecon.operators.resident.device_volume import DeviceVolume
+    from clrecon.operators.surface.spans import MakeSpans
     from clrecon.system.files import StagedFile
     from clrecon.system.progress import Progress
 
@@ -358,21 +358,24 @@ class _PassingMeshes:
         labels: LabelMap | None = None,
     ) -> list[Mesh]:
         """Write all surfaces; return for each a mesh without triangles, with its report."""
+        from clrecon.jobs.mesh.workers import open_spans_in_order
         from clrecon.operators.resident.device_volume import DeviceVolume
 
         self.paths = name_outputs(self._output, [surface.name for surface in surfaces])
-        with DeviceVolume(volume, device=device, memory=settings.memory) as resident:
-            return [self._write(resident, *each) for each in zip(surfaces, self.paths, strict=True)]
+        with (
+            DeviceVolume(volume, device=device, memory=settings.memory) as resident,
+            open_spans_in_order(volume, settings, progress) as spans,
+        ):
+            return [self._write(resident, spans, *each) for each in zip(surfaces, self.paths, strict=True)]
 
-    def _write(self, resident: DeviceVolume, surface: Surface, path: str | Path) -> Mesh:
+    def _write(self, resident: DeviceVolume, spans: MakeSpans | None, surface: Surface, path: str | Path) -> Mesh:
         import numpy as np
 
         from clrecon.mesh import Mesh
         from clrecon.mesh.written_parts import PartsFile
-        from clrecon.operators.surface.spans import DeviceSpans, PassingSurface
+        from clrecon.operators.surface.spans import PassingSurface
 
         run, settings = self._run, self._run.settings
-        spans = DeviceSpans(list_usable(), settings.memory) if settings.uses_all_devices else None
         passing = PassingSurface(
             resident, surface.iso_value, spans, closed=settings.closed, topology=settings.topology, below=surface.below,
             vertex_rule=settings.vertex_rule, progress=run.progress,

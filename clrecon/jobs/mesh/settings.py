@@ -306,7 +306,6 @@ class MeshSettings(options.SharedSettings):
     def _check_by_slabs(self) -> None:
         asked = name_parameter("by_slabs", True)
         options.refuse_changed(self, _OF_WHOLE_MESHES, f"{asked} keeps no mesh in memory, which this needs")
-        options.refuse_changed(self, ("scheduler",), f"{asked} writes what devices of this machine make")
 
     def _check_surface(self) -> None:
         """Refuse an unknown kind of surface, and `cortex` where HU do not place the outer surface of bone."""

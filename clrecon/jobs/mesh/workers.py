@@ -19,6 +19,7 @@ from clrecon.operators.surface.slabs import SampleGrid
 from clrecon.operators.surface.spans import (
     DeviceSpans,
     GridFacts,
+    MakeSpans,
     SentSpan,
     Span,
     SpanPart,
@@ -43,6 +44,16 @@ def extract_shared_out(
         _open_makers(volume, settings, progress) as (make_spans, count),
     ):
         return [extract_by_spans(resident, level, make_spans, count, progress=progress, **how) for level in levels]
+
+
+@contextmanager
+def open_spans_in_order(volume: Volume, settings: MeshSettings, progress: Progress) -> Iterator[MakeSpans | None]:
+    """Yield what makes spans in their order; None where the device of the volume does."""
+    if not settings.is_shared_out:
+        yield None
+        return
+    with _open_makers(volume, settings, progress) as (make_spans, _):
+        yield make_spans.make_in_order if isinstance(make_spans, ClusterSpans) else make_spans
 
 
 @contextmanager
@@ -76,6 +87,13 @@ class ClusterSpans:
                 raise DeviceError(f"slices {item.span[0]} to {item.span[1] - 1} cannot be done: {part.message}")
             volume.release_slices(item.first_slice, item.first_slice + len(item.voxels))
             yield item.span, part
+
+    def make_in_order(self, grid: SampleGrid, spans: Sequence[Span]) -> Iterator[tuple[Span, SpanPart]]:
+        """Make a few spans for each worker at a time, and yield them in order: no others wait in memory."""
+        count = _SPANS_A_WORKER * max(self._cluster.count_workers(), 1)
+        for first in range(0, len(spans), count):
+            parts = dict(self(grid, spans[first : first + count]))
+            yield from ((span, parts.pop(span)) for span in sorted(parts))
 
 
 def make_on_worker(sent: SentSpan, facts: GridFacts, memory: int | None) -> SpanPart:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import weakref
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from clrecon.cli.main import main
 from clrecon.errors import DeviceError, NoSurfaceError, OutputError, UsageError
 from clrecon.jobs.mesh.job import make_mesh
 from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.mesh.workers import ClusterSpans
 from clrecon.opencl import Device
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface.spans import PassingSurface
@@ -115,6 +117,31 @@ def test_no_more_than_two_parts_of_a_surface_that_passes_are_in_memory(device: D
     assert len(seen) > 5
 
 
+class LateCluster:
+    """A cluster of one worker whose tasks end in the opposite order."""
+
+    def __init__(self) -> None:
+        self.tasks: list[int] = []
+
+    def count_workers(self) -> int:
+        return 1
+
+    def run_tasks(self, function: Any, items: Iterable[Any], *shared: Any) -> Iterator[tuple[Any, Any]]:
+        sent = list(items)
+        self.tasks.append(len(sent))
+        yield from ((item, function(item, *shared)) for item in reversed(sent))
+
+
+def test_parts_of_workers_come_in_their_order_and_four_for_each_at_a_time(device: Device) -> None:
+    volume, cluster = make_noise(), LateCluster()
+    spans = ClusterSpans(cast("Any", cluster), memory=None)
+    resident = DeviceVolume(volume, device=device, memory=800_000)
+    by_workers = PassingSurface(resident, 0.0, spans.make_in_order, closed=True, below=False)
+    for part, expected in zip(by_workers.parts(), pass_by(volume, device).parts(), strict=True):
+        assert all(map(np.array_equal, part, expected))
+    assert max(cluster.tasks) == 4 and len(cluster.tasks) > 1
+
+
 def test_device_that_makes_other_numbers_than_it_has_counted_is_refused(device: Device) -> None:
     passing = pass_by(make_noise(), device)
     counted = passing.vertices
@@ -141,11 +168,6 @@ def test_volume_far_from_the_origin_is_made_whole(device: Device) -> None:
 def test_step_that_takes_the_mesh_as_a_whole_is_refused(given: dict[str, Any], name: str) -> None:
     with refused(UsageError, "by_slabs", name):
         MeshSettings(by_slabs=True, **given)
-
-
-def test_surface_by_slabs_takes_no_workers_of_a_scheduler() -> None:
-    with refused(UsageError, "by_slabs", "scheduler"):
-        MeshSettings(by_slabs=True, scheduler="local")
 
 
 def test_format_that_needs_the_whole_mesh_is_refused_before_the_scan_is_read(tmp_path: Path) -> None:
