@@ -37,6 +37,9 @@ _SETTINGS: Mapping[str, Any] = {
     # The default, a low MALLOC_TRIM_THRESHOLD_, gives every large temporary array back to the system: half of the time.
     "distributed.nanny.pre-spawn-environ": {"DASK_LOGGING__DISTRIBUTED": "critical"},
     "distributed.worker.profile.enabled": False,
+    # Looks of the processes at themselves: by default 3 % of a core beside a cluster of one worker, so 1 %.
+    "distributed.admin.tick.interval": "2s",
+    "distributed.admin.system-monitor.interval": "10s",
     # All memory of a case is "unmanaged", for which Dask would pause its workers.
     "distributed.worker.memory.target": False,
     "distributed.worker.memory.spill": False,
