@@ -77,6 +77,9 @@ class FakePainter:
         self.is_fitted = True
         return ["fitted"]
 
+    def find_offset(self, state: Any) -> None:
+        pass
+
     def find_fit_scale(self, state: Any) -> ColorScale | None:
         return ColorScale(2.0, signed=False) if state.color_by else None
 

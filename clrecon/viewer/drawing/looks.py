@@ -53,10 +53,16 @@ class Looks:
         self._kept: OrderedDict[Hashable, Style] = OrderedDict()
 
     def scan(
-        self, state: ViewState, mode: ViewMode, whole: ShownPart, labelled: LabelledLook | None, ray_step: float | None
+        self,
+        state: ViewState,
+        mode: ViewMode,
+        whole: ShownPart,
+        labelled: LabelledLook | None,
+        ray_step: float | None,
+        occlusion: float = 0.0,
     ) -> Style:
-        clip = state.clip
-        key = ("scan", mode.name, state.iso_value, state.picture_window, clip, whole, _key(labelled), ray_step)
+        clip, of_mode = state.clip, (mode.name, state.iso_value, state.picture_window, occlusion)
+        key = ("scan", of_mode, clip, whole, _key(labelled), ray_step)
         if (known := self._known(key)) is not None:
             return known
         if mode.kind == "projection":
@@ -64,7 +70,12 @@ class Looks:
             return self._keep(key, Projection(mode.style, window=window, ray_step=ray_step, clip=clip))  # type: ignore[arg-type]
         if mode.kind == "slices":
             return self._keep(key, SlicesInSpace(window=state.picture_window, clip=clip))
-        look = {"ray_step": ray_step, "clip": clip, **_label_fields(labelled, whole.opacity)}
+        look = {
+            "ray_step": ray_step,
+            "ambient_occlusion": occlusion,
+            "clip": clip,
+            **_label_fields(labelled, whole.opacity),
+        }
         if mode.kind == "volume":
             return self._keep(key, VolumeLook(mode.style, jitter=True, **look))  # type: ignore[arg-type]
         level = label_level if mode.kind == "labels" else state.iso_value

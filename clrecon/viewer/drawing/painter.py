@@ -285,7 +285,8 @@ class Painter(Stage):
             used = self.blank_labels(scan.number, resident.volume)
         if mode.kind not in ("surface", "volume"):
             used = None
-        style = self._looks.scan(state, mode, whole, used, coarse)
+        occlusion = 1.0 if state.occlusion and sharp else 0.0  # coarse pictures follow the slider of the iso value
+        style = self._looks.scan(state, mode, whole, used, coarse, occlusion)
         return _Drawn(scan.number, resident, style, used or labelled)
 
     def _drawn_labels(self, shown: ShownLabels, state: ViewState, whole: ShownPart, sharp: bool) -> _Drawn:

@@ -275,6 +275,23 @@ class Stage(DeviceWorker):
             return None
         return max((fit.scales[state.color_by] for fit in fits), key=lambda scale: scale.limit)
 
+    def find_offset(self, state: ViewState) -> dict[str, Any] | None:
+        """Return how far outside of the bone the iso value lies, for JSON; None before the surface was fitted there.
+
+        mm: Median of the first scan that is shown.  is_good: It is within the error of the fit.
+        """
+        fit = next(iter(self.find_fits(state).values()), None)
+        if fit is None:
+            return None
+        cortex = fit.sharp[0].report["cortex"]
+        outside, error = cortex["outside_mm"], cortex["error_mm"]
+        return {
+            "mm": round(outside["p50"], 3),
+            "range_mm": [round(outside["p5"], 3), round(outside["p95"], 3)],
+            "error_mm": round(error["p50"], 3),
+            "is_good": abs(outside["p50"]) <= error["p95"],
+        }
+
     def fit_scans(self, state: ViewState, progress: Progress | None = None) -> list[str]:
         """Fit the surfaces of the scans that are shown, where that was not done before; return lines about them."""
         lines = []

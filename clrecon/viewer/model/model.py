@@ -160,8 +160,8 @@ class ViewModel(ChangingView):
         self._change("mode", f"the mode {self.state.mode}", **self._fields_of(name))
 
     def state_in(self, name: str) -> ViewState:
-        """Return the state as it would be after `set_mode`."""
-        return replace(self.state, **self._fields_of(name))
+        """Return the state as it would be after `set_mode`, without what takes a small picture too long."""
+        return replace(self.state, occlusion=False, **self._fields_of(name))
 
     def _fields_of(self, mode: str) -> dict[str, Any]:
         camera = self.camera
@@ -192,6 +192,15 @@ class ViewModel(ChangingView):
             self._change("window", "the window", window=(low, high))
         else:
             raise UsageError(unknown_name("window", of, ("slices", "picture")))
+
+    def set_occlusion(self, on: bool) -> None:
+        """Darken hollows of scans, or light everything alike."""
+        if not self.scans:
+            raise UsageError("there is no scan: hollows of scans alone are darkened")
+        self._change("occlusion", "the light in hollows", occlusion=bool(on))
+
+    def toggle_occlusion(self) -> None:
+        self.set_occlusion(not self.state.occlusion)
 
     def set_table(self, shown: bool) -> None:
         """Show the table and the blankets, or the body alone."""
@@ -460,6 +469,7 @@ class ViewModel(ChangingView):
             "picture_window": list(state.picture_window or mode.window or ()) or None,
             "table": state.table,
             "fitted": state.fitted if self.scans and mode.kind == "surface" else None,
+            "occlusion": state.occlusion,
             "color_by": state.color_by,
             "cross": [round(value, 3) for value in state.cross],
             "slices": {plane: describe_slice(self.scans, plane, state.cross, state.turn) for plane in PLANES},

@@ -39,6 +39,7 @@ def encode_view(state: ViewState, objects: Sequence[ShownObject]) -> bytes:
         "picture_window_hu": None if state.picture_window is None else list(state.picture_window),
         "table_shown": state.table,
         "fitted": state.fitted,
+        "occlusion": state.occlusion,
         "color_by": state.color_by,
         "cross_lps_mm": list(state.cross),
         "turn": None if state.turn is None else [list(row) for row in state.turn],
@@ -130,6 +131,7 @@ def _apply(saved: Mapping[str, Any], trial: ViewModel) -> None:
     if trial.scans:
         trial.set_iso(saved["iso_value_hu"])
         trial.set_table(saved["table_shown"])
+        trial.set_occlusion(saved["occlusion"])
     if saved["picture_window_hu"] is not None:
         low, high = saved["picture_window_hu"]
         trial.set_window(low, high, of="picture")

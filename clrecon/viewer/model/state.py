@@ -174,6 +174,7 @@ class ViewState:
     picture_window: The same in projections; None: that of the mode.
     table: Table and blankets are shown.
     fitted: The surfaces of scans lie where they were fitted to the bone, in the mode "surface".
+    occlusion: Hollows of volume rendering and of surfaces at the iso value are darker (ambient occlusion).
     color_by: Number at the vertices of fitted surfaces that their colours show, one of `FIT_COLORS`.
     cross: Where the three slices go through.
     turn: Of the three slices, about the cross; None: they lie along the axes of the patient.
@@ -201,6 +202,7 @@ class ViewState:
     picture_window: tuple[float, float] | None = None
     table: bool = True
     fitted: bool = False
+    occlusion: bool = False
     color_by: str | None = None
     parts: tuple[ShownPart, ...] = ()
     parts_at: float | None = None
@@ -267,7 +269,7 @@ def picture_key(state: ViewState, view: str) -> Hashable:
         cut = (state.clips, state.clip_box)
         return (
             *(state.camera, state.mode, state.iso_value, state.picture_window, state.table),
-            *(state.fitted, state.color_by, parts, cut, state.compare),
+            *(state.fitted, state.color_by, parts, cut, state.compare, state.occlusion),
         )
     if view in SLICES:
         return (

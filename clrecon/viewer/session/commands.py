@@ -103,6 +103,8 @@ _model("set_mode", "what scans are shown as", "set_mode", name=_text)
 _model("step_mode", "go so many modes further down the list", "step_mode", steps=_whole)
 _model("set_window", "HU of black and white; of: slices or picture", "set_window",
        low=_check_number, high=_check_number, takes={"of": _text})  # fmt: skip
+_model("set_occlusion", "darken hollows of scans, or not", "set_occlusion", on=_flag)
+_model("toggle_occlusion", "darken hollows of scans, or not any more", "toggle_occlusion")
 _session("set_table", "show or take away table and blankets", "set_table", shown=_flag)
 _session("toggle_table", "take table and blankets away, or show them", "toggle_table")
 _session("set_fitted", "show surfaces fitted to the bone, or at the iso value", "set_fitted", shown=_flag)
@@ -229,6 +231,7 @@ _SECTIONS: dict[str, dict[str, Key]] = {
         "o": Key("next mode; O: the one before", {"do": "step_mode", "steps": 1}),
         "O": Key("", {"do": "step_mode", "steps": -1}),
         "b": Key("table and blankets away, or shown", {"do": "toggle_table"}),
+        "w": Key("hollows darker, or as light as all", {"do": "toggle_occlusion"}),
         "t": Key("surface fitted to the bone, or at the iso value", {"do": "toggle_fitted"}),
         "T": Key("fitted surface: thickness of the walls, error, plain", {"do": "step_color_by"}),
         "ArrowLeft": Key(f"{_ISO_STEP:g} HU lower; Right: higher", {"do": "step_iso", "by": -_ISO_STEP}, name="Left"),

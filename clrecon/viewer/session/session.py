@@ -235,6 +235,7 @@ class ViewSession(Closing):
                 **notes,
                 "seen_lines": self._seen_lines(),
                 "scale": self._describe_scale(),
+                "offset": self.painter.find_offset(self.model.state),
                 "busy": busy,
                 "error": self._error,
                 "said": self._said,

@@ -199,7 +199,7 @@
     const [passed, judged] = scan.gates, words = passed === judged ? `geometry: ${judged} gates passed` : `${judged - passed} of ${judged} gates failed`;
     const chip = element("button", words, { type: "button", className: passed === judged ? "good" : "wrong",
       title: "the certificate of the scan", onclick: () => find("certificate").showModal() });
-    find("chips").replaceChildren(...(judged ? [chip] : []));
+    if (judged) find("chips").prepend(chip);
     find("certificate").firstElementChild.replaceChildren(...fixed.scans.flatMap(({ name, certificate }) => [
       element("h2", name), ...certificate.map((line) => element("p", line)),
     ]));
@@ -217,7 +217,7 @@
     facts = now;
     const told = (name) => !before || JSON.stringify(before[name]) !== JSON.stringify(now[name]);
     if (now.tool !== choosing && !["only", "hide"].includes(choosing)) choosing = now.tool || "";
-    for (const id of ["iso", "tabled", "layouts", "spine", "windows"]) find(id).hidden = !now.iso;
+    for (const id of ["iso", "tabled", "hollowed", "layouts", "spine", "windows"]) find(id).hidden = !now.iso;
     find("modes").hidden = find("modewords").hidden = now.modes.length < 2;
     if (told("iso") && now.iso) showIso();
     if (told("modes")) showModes();
@@ -233,12 +233,14 @@
     find("shade").hidden = !now.fitted;
     find("shade").value = now.color_by || "";
     find("perspective").checked = !now.camera.parallel;
+    find("occlusion").checked = now.occlusion;
     find("compared").hidden = !now.comparable;
     find("compare").checked = now.compare !== null;
     find("divide").hidden = now.compare === null;
     if (held !== find("divide") && now.compare !== null) find("divide").value = now.compare;
     find("undo").disabled = !now.undo;
     find("undo").title = now.undo ? `take back ${now.undo} (u)` : "nothing to take back (u)";
+    if (told("offset") || told("iso")) showOffset();
     if (told("window")) showWindow();
     if (told("slab")) showSlab();
     find("straighten").hidden = !now.turned;
@@ -498,6 +500,8 @@
   find("fitted").onchange = () => run("set_fitted", { shown: find("fitted").checked });
   find("shade").onchange = () => run("set_color_by", { name: find("shade").value || null });
   find("perspective").onchange = () => run("set_perspective", { on: find("perspective").checked });
+  find("occlusion").onchange = () => run("set_occlusion", { on: find("occlusion").checked });
+  find("offset").onclick = () => run("toggle_fitted");
   find("compare").onchange = () => run("set_compare", { share: find("compare").checked ? 0.5 : null });
   hold(find("divide"), () => last("set_compare", { share: Number(find("divide").value) }));
   find("hu").addEventListener("wheel", (event) => {

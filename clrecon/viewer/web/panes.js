@@ -86,6 +86,18 @@
     write(title, width - 12, top - 18, "words", "end");
   }
 
+  // How far the iso value lies from the bone, once the surface was fitted there.
+  function showOffset() {
+    const { offset, iso } = facts, chip = find("offset");
+    chip.hidden = !offset;
+    if (!offset) return;
+    const { mm, range_mm: [least, most], error_mm: error } = offset;
+    chip.textContent = `${iso.hu.toFixed(0)} HU: ${Math.abs(mm).toFixed(2)} mm ${mm < 0 ? "inside" : "outside"} the bone`;
+    chip.className = offset.is_good ? "good" : "wrong";
+    chip.title = `median of the surface at the iso value; of 90 % ${least.toFixed(2)} to ${most.toFixed(2)} mm; error of the fit`
+      + ` ${error.toFixed(2)} mm. Click: fitted to the bone, or at the iso value (t)`;
+  }
+
   // The line of a comparison, with a handle to drag, and what is on either side of it.
   function annotateCompare(view, make, line, write, width, height) {
     const x = facts.compare * width, y = height * HANDLE, [first, second] = facts.objects.map(({ name }) => name);

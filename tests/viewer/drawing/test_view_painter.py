@@ -57,6 +57,20 @@ def test_picture_of_a_surface_in_a_view_is_that_of_render(open_model_and_painter
     assert np.array_equal(mine.image, other.image)
 
 
+@pytest.mark.parametrize("mode", ["surface", "bone"])
+def test_dark_hollows_are_those_of_ambient_occlusion_in_sharp_pictures_alone(mode, open_model_and_painter):
+    model, painter = open_model_and_painter()
+    model.set_mode(mode)
+    plain, coarse = (painter.picture(model.state, SIZE, sharp=sharp).image for sharp in (True, False))
+
+    model.toggle_occlusion()
+    darker = painter.picture(model.state, SIZE).image
+
+    assert (darker[..., :3] <= plain[..., :3]).all() and (darker < plain).any()
+    assert np.array_equal(darker[..., 3], plain[..., 3])
+    assert np.array_equal(painter.picture(model.state, SIZE, sharp=False).image, coarse)
+
+
 LARGE = (512, 520)
 """A size that is drawn in two strips."""
 

@@ -84,6 +84,19 @@ def test_a_fit_is_announced_lies_on_the_bone_and_is_taken_back(open_session) -> 
     assert picked_radius(view) > AT_ISO_MM
 
 
+def test_distance_of_the_iso_value_from_the_bone_is_told_where_the_surface_was_fitted(open_session) -> None:
+    view = open_session(shell_of_bone())
+    before = view.facts()["offset"]
+
+    after = do(view, "set_fitted", shown=True)["offset"]
+    do(view, "set_fitted", shown=False)
+    elsewhere = do(view, "set_iso", hu=400.0)["offset"]
+
+    assert before is None and elsewhere is None
+    assert after["mm"] == pytest.approx(0.55, abs=0.1)  # AT_ISO_MM
+    assert not after["is_good"]
+
+
 def test_a_view_asked_for_the_surface_of_the_cortex_begins_with_it(device, tmp_path: Path) -> None:
     shell_of_bone().save(tmp_path / "ct.nii.gz")
     scan = MeshSettings(surface="cortex", device=str(device.index))
