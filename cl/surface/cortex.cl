@@ -8,6 +8,9 @@
  *          +-------+----------+------> x, mm      The place x0 and the thickness t are searched; the three plateaus are
  *               x0 - t       x0                   linear and solved for at each x0 and t (variable projection).
  *
+ * Values between voxels are linear ones, which blurs further, by more the farther they are from voxels: each sample has
+ * its own variance, and the blur a third and a fourth cumulant (series of Gram and Charlier).
+ *
  * Reference: Treece et al. 2010, "High resolution cortical bone thickness measurement from clinical CT data", Med. Image
  * Anal. 14, 276-290; Golub and Pereyra 1973 (variable projection, with the Jacobian of Kaufman 1975); Abramowitz and
  * Stegun 1964, 26.2.17 (Phi); Keys 1981 (cubic convolution).
@@ -27,7 +30,10 @@
 #define ROUNDS 6 /* steps of Levenberg and Marquardt */
 #define SLACK 1.0003f /* a step that costs so little more counts as one that helps: near the best place costs are rounding */
 #define SHARPNESS -0.75f /* parameter of the cubic convolution between slices */
-#define ROWS 15 /* of a profile: samples, square of the normal's part across the slices, square of the gap there */
+#define MEAN_SPREAD 0.16666667f /* of linear interpolation, in squares of the step between voxels */
+#define LEAST_SPREAD 0.15f /* variance of a sample's blur, as a share of that of its profile */
+#define FRAME 2 /* rows: square of the normal's part across the slices, square of the gap there */
+#define ROWS 54 /* of a profile: its samples, its frame, and three by three what interpolation adds to their blur */
 
 /* The value between four voxels of a slice. */
 static inline float between_voxels(
@@ -38,13 +44,24 @@ static inline float between_voxels(
     return below + fj * (above - below);
 }
 
+/* What linear interpolation at a share of the way between two voxels, which lie step mm apart along a profile, adds to the
+ * blur there: variance beyond the mean over all shares, a sixth of the third cumulant, a 24th of the fourth. */
+static inline float3 series_of(const float share, const float step)
+{
+    const float spread = share * (1.0f - share), square = step * step;
+    return (float3)(square * (spread - MEAN_SPREAD), square * step * spread * (2.0f * share - 1.0f) * (1.0f / 6.0f),
+        square * square * spread * (1.0f - 6.0f * spread) * (1.0f / 24.0f));
+}
+
 /* Parameters  voxels      in   the slices first_k and following of a volume of (nk, nj, ni)
  *             slices      in   (nk) x y: what i and j are counted from in the slice, in the steps of slice 0; z: its height,
  *                              mm; w: 1 / height to the next slice, 0 for the last
  *             places      in   (count) i and j in slice 0, height in mm; w: number of the slice at or below
  *             directions  in   (count) the same three per mm along the outward normal
  *             profiles    out  (ROWS, stride) HU at first_mm + n * step_mm, NaN beyond the volume; square of the normal's
- *                              part across the slices; square of the gap there, in units of usual_gap
+ *                              part across the slices; square of the gap there, in units of usual_gap; and see series_of
+ *             i_square j_square  squares of the steps between voxels in a slice, mm2
+ *             known_k     1, or 0 where what interpolation between slices adds is its mean alone
  *             ni nj nk, first_k
  * Launch      global = count rounded up by the host, any local
  * Assumes     all slices that a profile meets are there; with CUBIC one more on either side
@@ -53,7 +70,8 @@ __kernel void sample_profiles(
     __global const VOXEL *restrict voxels, __global const float4 *restrict slices,
     __global const float4 *restrict places, __global const float4 *restrict directions,
     __global float *restrict profiles, const int ni, const int nj, const int nk, const int first_k,
-    const float first_mm, const float step_mm, const float usual_gap, const uint stride, const uint count)
+    const float first_mm, const float step_mm, const float usual_gap, const float i_square, const float j_square,
+    const float known_k, const uint stride, const uint count)
 {
     const uint item = get_global_id(0);
     if (item >= count)
@@ -98,6 +116,14 @@ __kernel void sample_profiles(
         }
 #endif
         profiles[(size_t)n * stride + item] = is_within ? value : NAN;
+        const float along_i = i_square * direction.x, along_j = j_square * direction.y;
+        const float along_k = known_k
+            * ((above.x - below.x) * along_i + (above.y - below.y) * along_j + (above.z - below.z) * direction.z);
+        const float3 series = series_of(fi, along_i) + series_of(fj, along_j) + series_of(fk, along_k);
+        __global float *more = profiles + (size_t)(SAMPLES + FRAME + n) * stride + item;
+        more[0] = series.x;
+        more[(size_t)SAMPLES * stride] = series.y;
+        more[2 * (size_t)SAMPLES * stride] = series.z;
     }
 }
 
@@ -122,6 +148,15 @@ static inline floats normal_share(const floats z, floats *density)
     return choose(z >= 0.0f, 1.0f - tail, tail);
 }
 
+/* Phi(z) where the blur has a third and a fourth cumulant (Gram and Charlier), and its derivative. */
+static inline floats edge_share(const floats z, const floats third, const floats fourth, floats *density)
+{
+    floats normal;
+    const floats share = normal_share(z, &normal), zz = z * z, cubic = z * (zz - 3.0f);
+    *density = normal * (1.0f + third * cubic + fourth * (zz * (zz - 6.0f) + 3.0f));
+    return share - normal * (third * (zz - 1.0f) + fourth * cubic);
+}
+
 /* The profiles of LANES places, the samples of each that count, and what is known before: means and precisions of the
  * plateaus, in thousands of HU and in units of the weight of a sample. */
 typedef struct {
@@ -143,15 +178,21 @@ static inline __attribute__((always_inline)) wall_fit fit_plateaus(const wall_pr
     floats oo = (floats)(p->keep_outer), kk = (floats)(p->keep_cortex), ii = (floats)(p->keep_inner);
     floats ok = (floats)(0.0f), oi = ok, ki = ok, yo = ok, yk = ok, yi = ok, yy = ok;
     floats pp = ok, pq = ok, qq = ok, po = ok, pk = ok, pi = ok, qo = ok, qk = ok, qi = ok, yp = ok, yq = ok;
-    const floats sharp = 1.0f / p->blur;
+    const floats square = p->blur * p->blur, least = LEAST_SPREAD * square;
     for (int n = 0; n < SAMPLES; ++n) {
-        const floats given = load_lanes(p->values + (size_t)n * p->stride);
+        __global const float *of_sample = p->values + (size_t)n * p->stride;
+        const floats given = load_lanes(of_sample);
         const ints counts = (p->low <= n) & (p->high >= n);
         const floats w = choose(counts, (floats)(p->weights[n]), (floats)(0.0f));
         const floats y = choose(counts, 0.001f * given - p->cortex, (floats)(0.0f));
+        of_sample += (size_t)(SAMPLES + FRAME) * p->stride;
+        const floats sharp = 1.0f / sqrt(greater(square + load_lanes(of_sample), least)), cube = sharp * sharp * sharp;
+        const floats third = cube * load_lanes(of_sample + (size_t)SAMPLES * p->stride);
+        const floats fourth = cube * sharp * load_lanes(of_sample + 2 * (size_t)SAMPLES * p->stride);
         const floats z = ((p->first_mm + (float)n * p->step_mm) - x0) * sharp;
         floats rise, fall;
-        const floats o = normal_share(z, &rise), i = normal_share(-(z + t * sharp), &fall), k = 1.0f - o - i;
+        const floats o = edge_share(z, third, fourth, &rise), i = 1.0f - edge_share(z + t * sharp, third, fourth, &fall);
+        const floats k = 1.0f - o - i;
         const floats a = rise * sharp, b = fall * sharp; /* derivatives of o and i by x0, but for the sign of a */
         const floats wo = w * o, wk = w * k, wi = w * i, wa = w * a, wb = w * b;
         oo += wo * o;

@@ -42,6 +42,7 @@ Float64Array = NDArray[np.float64]
 
 SAMPLES = kernel_constant("surface/cortex.cl", "SAMPLES")
 CENTRE = kernel_constant("surface/cortex.cl", "CENTRE")
+FRAME = kernel_constant("surface/cortex.cl", "FRAME")
 ROWS = kernel_constant("surface/cortex.cl", "ROWS")
 RESULTS = kernel_constant("surface/cortex.cl", "RESULTS")
 
@@ -53,6 +54,10 @@ PIECE, SMALLEST_PIECE = 1 << 18, 1 << 8
 
 STEP_MM = 0.5
 """Step of a profile at voxels of 1 mm3; half this step gave the same positions to within 0.003 mm."""
+
+_COARSE = 2.0
+"""Where slices are thicker than so many pixels, what interpolation between them adds to the blur is its mean over all
+places: a series of three terms does not describe it there."""
 
 _SMALLEST_SCALE, _LARGEST_SCALE = 0.001, 1.4
 """Bounds of the edge of a voxel's cube, mm, by which profiles are scaled."""
@@ -99,6 +104,7 @@ class StackFrame:
 
     slices: ndarray, shape (nk, 4), float32. As the kernel takes them.
     steps: ndarray, shape (3, 3). From voxel to voxel along i, j and, at the usual gap, k, LPS mm.
+    squares: Of the first two steps, mm2.
     """
 
     def __init__(self, volume: Volume):
@@ -114,6 +120,7 @@ class StackFrame:
         self.usual_gap = float(np.median(self.gaps)) if len(self.gaps) else 1.0
         along_k = volume.affine[:3, 2]
         self.steps = np.stack([*volume.affine[:3, :2].T, along_k * (self.usual_gap / abs(along_k @ normal))])
+        self.squares = np.square(self.steps[:2]).sum(axis=1).tolist()
         self.slices = np.zeros((len(origins), 4), np.float32)
         self.slices[:, :3] = (origins - self._origin) @ self._matrix.T
         self.slices[:-1, 3] = 1.0 / self.gaps
@@ -221,7 +228,7 @@ class WallFits:
 
 
 def blurs_of(frames: Float32Array, blur_mm: float, across_mm: float) -> Float32Array:
-    """Return the width of the blur along profiles, mm, from their last rows (2, n): it grows with the slices' gap."""
+    """Return the width of the blur along profiles, mm, from their frames (2, n): it grows with the slices' gap."""
     steep, gap = frames
     across = np.maximum(blur_mm**2 + (across_mm**2 - blur_mm**2) * gap, 0.1 * blur_mm**2)
     return np.asarray(np.sqrt(blur_mm**2 * (1.0 - steep) + across * steep), np.float32)
@@ -268,8 +275,8 @@ class WallProfiles:
         return WallFits(*download(device, fits, fits_d)[:, : self._count])
 
     def frames(self) -> Float32Array:
-        """Return the last rows of the profiles, shape (2, n): how each lies across the slices, and their gap there."""
-        rows = np.empty((ROWS - SAMPLES, self._stride), np.float32)
+        """Return the frames of the profiles, shape (FRAME, n): how each lies across the slices, and their gap there."""
+        rows = np.empty((FRAME, self._stride), np.float32)
         return download(self._device, rows, self._values_d, 4 * SAMPLES * self._stride)[:, : self._count]
 
     def fit_with(self, constants: CortexConstants) -> WallFits:
@@ -311,6 +318,8 @@ class ProfileSampler:
         self._cubic = cubic
         self.device = resident.device
         self.scale, self.frame = ProfileScale.of(resident.volume), StackFrame(resident.volume)
+        is_coarse = self.frame.usual_gap > _COARSE * float(np.sqrt(np.mean(self.frame.squares)))
+        self._known_k = 0.0 if cubic or is_coarse else 1.0
         with stopwatch.timed("build"):
             self.program = prepare_profiles(self.device, resident.dtype, cubic=cubic)
 
@@ -361,6 +370,7 @@ class ProfileSampler:
             slices=upload(device, self.frame.slices), places=upload(device, places),
             directions=upload(device, directions), profiles=values_d, ni=ni, nj=nj, nk=nk, first_k=first_k,
             first_mm=self.scale.first_mm, step_mm=self.scale.step_mm, usual_gap=self.frame.usual_gap,
+            i_square=self.frame.squares[0], j_square=self.frame.squares[1], known_k=self._known_k,
             stride=stride, count=len(places),
         )  # fmt: skip
         return values_d

@@ -16,6 +16,7 @@ from clrecon.mesh.compare.walls import COMPACT_HU
 from clrecon.operators.surface.cortex import (
     CENTRE,
     CORTEX_SPREAD,
+    FRAME,
     SAMPLES,
     SILENT_HU,
     CortexConstants,
@@ -50,7 +51,17 @@ _THICK_SHARE = 0.5
 _CORTEX_STEP = 1.03
 _CLEARLY_LESS = 0.97
 """Where this share of the walls is thick, the cortex is what leaves least of the profiles, in steps of the second from
-what they show on: their percentile holds noise, which the blurs follow, and it them (11 % too much at 40 HU)."""
+what they show on, down as long as less than the third of it is left: their percentile holds noise, which the blurs
+follow, and it them (11 % too much at 40 HU)."""
+
+_UPWARD_STEP, _UPWARD_STEPS = 1.04, 8
+_ALMOST = 1.02
+"""Where fewer are thick, what blur makes thick is not dense: of so many steps up the first is taken that leaves the
+third times the least or less (with what walls show the surface lay 0.1 mm too far outside at a blur of 1 mm)."""
+
+STEPPED = 1.5
+"""Slices that blur across by more than so often what they blur within make steps of slanted walls: their profiles show
+no cortex."""
 
 LEAST_SHARE = 0.03
 _DIFFERENT, _ALIKE = 0.1, 0.02
@@ -66,21 +77,25 @@ _FEWEST_THICK = 12
 the fit leaves the cortex free within the third; of these the percentile, since walls differ and blur only ever lowers
 them."""
 
-_ALIKE_THICK = 1.55
+SOLID_SHARE = 0.85
+"""Of bone that has this share of its cortex' HU behind it nothing shows where the cortex ends: it is as thick as the
+profile is deep, at least.  Marrow of balls had up to 0.7, bone without marrow 0.87 to 1.05."""
+
+_ALIKE_THICK, _THIN_BLURS = 1.55, 3.0
 _SOLID_BLURS, _AS_DENSE = 4.0, 0.95
 _MOST_RIMS = 0.1
-"""Walls whose 85th percentile of thickness is less than the first times the 15th are alike: of thin ones profiles do
-not tell a denser wall from a thicker one.  Shells and plates of 0.5 to 2 mm have 1.1 to 1.5, bodies 1.7 to 5.  What was
-measured in them is the least that describes them.  Walls of more than the second in blurs do not count, which are rims,
-with 0.7 to 0.9 of these HU; if they show the third of these or more, or are more than the fourth share of all, they are
-solid, and the cortex is known."""
+"""Walls whose 85th percentile of thickness is less than the first times the 15th are alike, and thin if the median in
+blurs is below the second: profiles do not tell a denser wall from a thicker one.  Shells and plates of 0.5 to 2 mm have
+1.1 to 1.5, bodies 1.7 to 5.  What was measured in them is the least that describes them.  Walls of more than the third
+in blurs do not count, which are rims, with 0.7 to 0.9 of these HU; if they show the fourth of these or more, or are
+more than the fifth share of all, they are solid, and the cortex is known."""
 
-_AS_WELL = 1.1
+_AS_WELL, _LEAST_LEFT = 1.05, 0.006
 _DENSER_STEP, _MOST_DENSER = 1.1, 2.2
-_DENSER_SHARE = 1.0 / 3.0
-"""The cortex of such walls lies anywhere from there to the HU that leave the first times as much of the profiles, tried
-in steps of the second up to the third; the fourth share of the way is taken (of 13 shells and plates that of 12 lay at
-a quarter to all of it, of one at its beginning)."""
+_DENSER_SHARE = 0.5
+"""The cortex of such walls lies anywhere from there to the HU that leave the first times as much of the profiles, or
+times the second of these HU where less is left; tried in steps of the third up to the fourth.  The last share of the
+way is taken (noisy balls with walls of 0.8 to 2 mm lay 0.06 mm off with it, 0.10 with a third)."""
 
 _ACROSS_UNSEEN, _ONE_DIRECTION = 0.13, 0.08
 _UNSEEN_ERROR = 0.5
@@ -177,18 +192,23 @@ def _measure_errors(
     return known if together is None else known.changed(denser=list(denser))
 
 
-def _find_denser(walls: _Walls, trial: _Trial) -> tuple[_Trial, _Trial] | None:
-    """Return what is taken of the constants that describe alike walls as well, and their dense end; None for one."""
-    blurs = blurs_of(walls.values[SAMPLES:], trial.blur_mm, trial.across_mm)
+def _are_alike(walls: _Walls, trial: _Trial) -> bool:
+    """Tell whether all walls are thin and alike, so that they do not show their HU, see `_ALIKE_THICK`."""
+    blurs = blurs_of(walls.values[SAMPLES : SAMPLES + FRAME], trial.blur_mm, trial.across_mm)
     fits = walls.fit(trial, _WIDE_SPREAD)
     ratios = fits.thickness_mm / blurs
     is_solid = ratios > _SOLID_BLURS
     solid = fits.cortex_hu[is_solid]
     shows_solid = len(solid) >= _FEWEST_THICK and np.percentile(solid, _DENSE_PERCENTILE) > _AS_DENSE * trial.cortex_hu
     if shows_solid or len(solid) > _MOST_RIMS * len(ratios):
-        return None
+        return False
     thin, thick = np.percentile(ratios[~is_solid], (15.0, 85.0))
-    if thick >= _ALIKE_THICK * thin:
+    return bool(thick < _ALIKE_THICK * thin and np.median(ratios) < _THIN_BLURS)
+
+
+def _find_denser(walls: _Walls, trial: _Trial) -> tuple[_Trial, _Trial] | None:
+    """Return what is taken of the constants that describe alike walls as well, and their dense end; None for one."""
+    if not _are_alike(walls, trial):
         return None
     end, least = trial, _left(walls, slice(None), trial)
     most = min(_MOST_DENSER * trial.cortex_hu, METAL_HU)
@@ -196,7 +216,7 @@ def _find_denser(walls: _Walls, trial: _Trial) -> tuple[_Trial, _Trial] | None:
         candidate = end._replace(cortex_hu=end.cortex_hu * _DENSER_STEP)
         candidate = _search_blurs(walls, slice(None), candidate, SEARCH_STEPS[1:])
         left = _left(walls, slice(None), candidate)
-        if left > _AS_WELL * least:
+        if left > _AS_WELL * max(least, (_LEAST_LEFT * trial.cortex_hu) ** 2):
             break
         end, least = candidate, min(left, least)
     if end is trial:
@@ -289,13 +309,26 @@ def _search(walls: _Walls, volume: Volume) -> tuple[_Trial, int]:
         best = candidate
         cortex_hu, thick = _measure_cortex(walls, slice(None), best)
     if not shown:
-        return best._replace(cortex_hu=cortex_hu), thick
+        return _search_upwards(walls, best._replace(cortex_hu=cortex_hu)), thick
     while True:
         candidate = best._replace(cortex_hu=best.cortex_hu / _CORTEX_STEP)
         candidate = _search_blurs(walls, slice(None), candidate, SEARCH_STEPS[2:])
         if _left(walls, slice(None), candidate) >= _CLEARLY_LESS * _left(walls, slice(None), best):
             return best, thick
         best = candidate
+
+
+def _search_upwards(walls: _Walls, trial: _Trial) -> _Trial:
+    """Return a trial whose cortex describes the profiles, where few walls are thick enough to show it."""
+    is_solid = np.median(walls.fit(trial, _WIDE_SPREAD).inner_hu) > SOLID_SHARE * trial.cortex_hu
+    if is_solid or trial.across_mm > STEPPED * trial.blur_mm or _are_alike(walls, trial):
+        return trial
+    trials = [_search_blurs(walls, slice(None), trial, SEARCH_STEPS[2:])]
+    for _ in range(_UPWARD_STEPS):
+        denser = trials[-1]._replace(cortex_hu=trials[-1].cortex_hu * _UPWARD_STEP)
+        trials.append(_search_blurs(walls, slice(None), denser, SEARCH_STEPS[1:]))
+    left = [_left(walls, slice(None), each) for each in trials]
+    return next(each for each, value in zip(trials, left, strict=True) if value <= _ALMOST * min(left))
 
 
 def _left(walls: _Walls, part: slice, trial: _Trial) -> float:
@@ -320,7 +353,7 @@ def _search_blurs(walls: _Walls, part: slice, best: _Trial, factors: tuple[float
 def _measure_cortex(walls: _Walls, part: slice, trial: _Trial) -> tuple[float, int]:
     """Return the HU of compact bone in a part of the profiles, and how many walls are thick enough to show it."""
     fits = walls.fit(trial, _WIDE_SPREAD)
-    blurs = blurs_of(walls.values[SAMPLES:, part], trial.blur_mm, trial.across_mm)
+    blurs = blurs_of(walls.values[SAMPLES : SAMPLES + FRAME, part], trial.blur_mm, trial.across_mm)
     thick = (fits.thickness_mm[part] > _THICK_BLURS * blurs) & (blurs < _SHARP * trial.blur_mm)
     if np.count_nonzero(thick) < _FEWEST_THICK:
         return trial.cortex_hu, int(np.count_nonzero(thick))

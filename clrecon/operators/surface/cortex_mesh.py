@@ -31,7 +31,7 @@ from clrecon.operators.surface.cortex import (
     blurs_of,
     unexplained_hu,
 )
-from clrecon.operators.surface.cortex_constants import find_groups, measure_constants
+from clrecon.operators.surface.cortex_constants import SOLID_SHARE, STEPPED, find_groups, measure_constants
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.pieces import chunks, in_threads, spread_rows
@@ -53,10 +53,6 @@ _THINNEST_BLURS, EDGE_SHARE = 0.2, 0.6
 """A wall thinner than so many blurs, before something of less than this share of the cortex' HU, is an edge without a
 wall: a vessel, an organ, marrow.  Of true walls 1 to 3 % are as thin."""
 
-_SOLID_SHARE = 0.85
-"""Of bone that has this share of its cortex' HU behind it nothing shows where the cortex ends: it is as thick as the
-profile is deep, at least.  Marrow of balls had up to 0.7, bone without marrow 0.87 to 1.05."""
-
 _ACROSS, _HIDDEN_BLURS = 1.25, 0.3
 """Where a profile is blurred by more than so often what slices are within themselves, a wall thinner than so many of
 these blurs is badly fitted: thick slices hide where within them it lies."""
@@ -67,12 +63,6 @@ _RINGS, _CORNERS = 3, 12.0
 _MOST_RESIDUAL, _LEAST_CORTEX = 3.0, 0.7
 """Residual, in what noise and model explain, from which on a profile is not that of a wall, and the share of the scan's
 cortex below which a wall is not of bone alone: a vessel with contrast medium or a disc touches it."""
-
-_STEPPED = 1.5
-"""Slices that blur across by more than so often what they blur within make steps of slanted walls, whose normals are 30
-to 40 degrees off: the fit is made again along those of the moved surface, as means over the triangles around.  Values
-between slices are then those of a cubic convolution: linear ones are blurred by more (with slices of 4 mm 0.38 mm off
-for 0.35)."""
 
 _LONE_SHARE = 0.5
 """Share of a vertex' neighbours that are fitted from which on it is of their wall, though its own profile shows none:
@@ -88,15 +78,15 @@ MOST_SHIFT_MM = 2.5
 _WEIGHT_FACTOR, _LEAST_WEIGHED = 1.125, 0.054
 """By what the fit's own error is multiplied where it weighs neighbours, and what is added in squares, in blurs."""
 
-_ERROR_FACTOR, _LEAST_ERROR = 0.95, 0.03
-_COARSE_ERROR = 0.033
-"""The same of the error that is stated, and the share of step^3 / blur^2 that is added in squares: interpolated values
-are blurred more between voxels than at them, which the model does not know."""
+_ERROR_FACTOR, _LEAST_ERROR = 0.85, 0.03
+_COARSE_ERROR = 0.031
+"""The same of the error that is stated, and the share of step^3 / blur^2 that is added in squares: what interpolation
+between voxels blurs is known as a series of three terms."""
 
 
 _DENSER_ERROR = np.float32(0.5)
-"""Standard error of what lies anywhere from half as far on the other side up to 1: from the least cortex to the densest
-where a third of the way is taken."""
+"""Standard error of what lies anywhere from as far on the other side up to 1: from the least cortex to the densest
+where half of the way is taken."""
 
 
 @dataclass(frozen=True)
@@ -170,7 +160,7 @@ def fit_walls(
                 hidden = (blurs > _ACROSS * known.blur_mm) & (walls.thickness_mm < _HIDDEN_BLURS * blurs)
                 fit.states[rows] = judge_walls(walls, known, sampler.scale, hidden)
                 fit.hidden[rows] = hidden & (fit.states[rows] == _BADLY_FITTED)
-                is_solid = walls.inner_hu > _SOLID_SHARE * walls.cortex_hu
+                is_solid = walls.inner_hu > SOLID_SHARE * walls.cortex_hu
                 depth_mm = np.float32(-sampler.scale.first_mm)
                 fit.thickness_mm[rows] = np.maximum(walls.thickness_mm, np.where(is_solid, depth_mm, np.float32(0.0)))
                 fit.shift_mm[rows], fit.room_mm[rows] = walls.shift_mm, walls.room_mm
@@ -418,7 +408,10 @@ def fit_mesh(
     fit = fit_along(normals, constants=constants)
     _refuse_few(int(np.count_nonzero(fit.states == FITTED)), len(fit.states))
     steps.take()
-    is_stepped = fit.constants.blur_across_mm > _STEPPED * fit.constants.blur_mm
+    # Normals of steps are 30 to 40 degrees off: the fit is made again along those of the moved surface, as means over
+    # the triangles around.  Values between slices are then those of a cubic convolution: linear ones are blurred by
+    # more (with slices of 4 mm 0.38 mm off for 0.35).
+    is_stepped = fit.constants.blur_across_mm > STEPPED * fit.constants.blur_mm
     if not is_stepped:
         doubt_lone_vertices(fit, mesh.triangles, fans)
     wanted, calm = _place_vertices(fit, mesh, normals, fans)

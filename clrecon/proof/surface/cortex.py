@@ -13,12 +13,19 @@ from clrecon.geometry import Volume, slice_normal
 Float64Array = NDArray[np.float64]
 
 SAMPLES, CENTRE = 13, 7
+FRAME = 2
 
 SHARPNESS = -0.75
 """Parameter of the cubic convolution between slices."""
 
 INNER_SHARE = 0.25
 """Expected HU of marrow, as a share of those of cortex."""
+
+MEAN_SPREAD = 1.0 / 6.0
+"""Variance of linear interpolation, in squares of the step between voxels, over all places between them."""
+
+LEAST_SPREAD = 0.15
+"""Variance of a sample's blur, as a share of that of its profile."""
 
 ROUNDS, SLACK = 6, 1.0003
 THINNEST = 0.05
@@ -44,14 +51,29 @@ def _convolution(distance: Float64Array) -> Float64Array:
     return np.where(distance < 1.0, near, far)
 
 
+def _series(shares: Float64Array, steps: Float64Array) -> Float64Array:
+    """Return what linear interpolation along axes adds to the blur of profiles, shape (3, n), see cl/surface/cortex.cl.
+
+    shares, steps: shape (n, 3). Of the way between two voxels, and how far apart these lie along the profile, mm.
+    """
+    spread = shares * (1.0 - shares)
+    third, fourth = spread * (2.0 * shares - 1.0) / 6.0, spread * (1.0 - 6.0 * spread) / 24.0
+    terms = steps**2 * (spread - MEAN_SPREAD), steps**3 * third, steps**4 * fourth
+    return np.stack([term.sum(axis=1) for term in terms])
+
+
 def sample_profiles(
     volume: Volume, points: NDArray[np.floating], normals: NDArray[np.floating], scale: Scale, *, cubic: bool = False
 ) -> Float64Array:
-    """Return the profiles, shape (SAMPLES + 2, n), as cl/surface/cortex.cl has them."""
+    """Return the profiles, shape (4 * SAMPLES + FRAME, n), as cl/surface/cortex.cl has them.
+
+    Slices must be less than two pixels apart, unless `cubic`.
+    """
     normal = slice_normal(volume.affine)
     heights = np.abs(np.diff(volume.slice_origins() @ normal))
     last = np.array(volume.shape_ijk) - 1
-    profiles = np.empty((SAMPLES + 2, len(points)))
+    profiles = np.empty((4 * SAMPLES + FRAME, len(points)))
+    to_next = (1.0 - cubic) * np.diff(volume.slice_origins(), axis=0)
     voxels = volume.voxels.astype(np.float64)
     for n in range(SAMPLES):
         ijk = volume.lps_to_ijk(points + (scale.first_mm + n * scale.step_mm) * normals)
@@ -74,6 +96,8 @@ def sample_profiles(
                 in_slice += parts[0] * parts[1] * voxels[np.clip(k + step, 0, last[2]), j, i]
             value += weight * in_slice
         profiles[n] = np.where(inside, value, np.nan)
+        steps = np.column_stack([normals @ volume.affine[:3, :2], np.einsum("na,na->n", normals, to_next[k])])
+        profiles[SAMPLES + FRAME + n :: SAMPLES] = _series(share, steps)
     layers = np.clip(np.floor(volume.lps_to_ijk(points)[:, 2]).astype(int), 0, len(heights) - 1)
     profiles[SAMPLES] = np.square(normals @ normal)
     profiles[SAMPLES + 1] = np.square(heights[layers] / np.median(heights))
@@ -141,10 +165,14 @@ def fit_profiles(
     precisions: tuple[float, float, float],
     rise: float,
 ) -> Float64Array:
-    """Return results (9, n) of profiles (SAMPLES + 2, n); `precisions` of the HU around, of cortex and inside."""
-    steep, gap = profiles[SAMPLES], profiles[SAMPLES + 1]
+    """Return results (9, n) of profiles, see `sample_profiles`; precisions of the HU around, of cortex and inside."""
+    steep, gap = profiles[SAMPLES : SAMPLES + FRAME]
+    spread, *cumulants = profiles[SAMPLES + FRAME :].reshape(3, SAMPLES, -1).transpose(0, 2, 1)
     over = np.maximum(blur_mm**2 + (across_mm**2 - blur_mm**2) * gap, 0.1 * blur_mm**2)
     width = np.sqrt(blur_mm**2 * (1.0 - steep) + over * steep)
+    square = width[:, None] ** 2
+    widths = np.sqrt(np.maximum(square + spread, LEAST_SPREAD * square))
+    third, fourth = cumulants[0] / widths**3, cumulants[1] / widths**4
     first, last, peak = find_wall(profiles, rise)
     places = scale.first_mm + scale.step_mm * np.arange(SAMPLES)
     counts = (np.arange(SAMPLES) >= first[:, None]) & (np.arange(SAMPLES) <= last[:, None])
@@ -153,12 +181,16 @@ def fit_profiles(
     expected = np.array([0.0, 0.0, (INNER_SHARE - 1.0) * cortex_hu / 1000.0])
     precision = np.array(precisions)
 
+    def edge_share(z: Float64Array) -> tuple[Float64Array, Float64Array]:
+        density = np.exp(-0.5 * z**2) / np.sqrt(2.0 * np.pi)
+        share = _normal_share(z) - density * (third * (z**2 - 1.0) + fourth * (z**3 - 3.0 * z))
+        return share, density * (1.0 + third * (z**3 - 3.0 * z) + fourth * (z**4 - 6.0 * z**2 + 3.0)) / widths
+
     def fit_walls(x0: Float64Array, t: Float64Array) -> _Fit:
-        z, behind = (places - x0[:, None]) / width[:, None], (places - x0[:, None] + t[:, None]) / width[:, None]
-        outer, inner = _normal_share(z), _normal_share(-behind)
+        outer, rise_x = edge_share((places - x0[:, None]) / widths)
+        solid, fall_x = edge_share((places - x0[:, None] + t[:, None]) / widths)
+        inner = 1.0 - solid
         shares = np.stack([outer, 1.0 - outer - inner, inner], axis=2)
-        rise_x = np.exp(-0.5 * z**2) / np.sqrt(2.0 * np.pi) / width[:, None]
-        fall_x = np.exp(-0.5 * behind**2) / np.sqrt(2.0 * np.pi) / width[:, None]
         square = np.einsum("ns,nsa,nsb->nab", weights, shares, shares) + np.diag(precision)
         plateaus = np.linalg.solve(
             square, (np.einsum("ns,nsa,ns->na", weights, shares, values) + precision * expected)[..., None]

@@ -373,7 +373,7 @@ def _check_profiles(device: Device, dtype: str, uneven: bool, cubic: bool) -> st
 
 
 def make_walls(count: int, seed: int) -> NDArray[np.float32]:
-    """Return profiles (SAMPLES + 2, count) of walls of all kinds with noise, some of them cut off or beside another."""
+    """Return profiles (ROWS, count) of walls of all kinds with noise, some of them cut off or beside another."""
     random = np.random.default_rng(seed)
     x = 0.5 * (np.arange(SAMPLES) - 7.0)
     wall_place, thickness = random.uniform(-1.6, 0.2, count), random.uniform(0.2, 4.0, count)
@@ -389,7 +389,9 @@ def make_walls(count: int, seed: int) -> NDArray[np.float32]:
     values[:2, is_joint] += 500.0
     values[11:, ::17] = np.nan
     values[:, 5::31] = np.nan
-    return np.vstack([values, random.random(count), random.choice([1.0, 2.3], count)]).astype(np.float32)
+    frames = random.random(count), random.choice([1.0, 2.3], count)
+    series = random.uniform(-1.0, 1.0, (3, SAMPLES, count)) * np.reshape([0.16, 0.02, 0.005], (3, 1, 1))
+    return np.vstack([values, *frames, *series]).astype(np.float32)
 
 
 def _check_fits(device: Device) -> str:

@@ -98,12 +98,27 @@ def test_errors_of_a_fitted_shell_hold_nine_tenths_of_its_distances_from_the_tru
     assert (np.abs(away) < 1.96 * fit.error_mm[rows]).mean() > 0.9  # measured 1
 
 
-def test_errors_in_voxels_coarse_beside_the_blur_hold_the_distances_from_the_truth(device):
-    """A blur of 0.3 mm in voxels of 1 mm: interpolation between them blurs by more than the scan does."""
-    mesh, fit = fit_surface(hollow_ball(thickness=3.0, blur=0.3), device)
+def test_a_fitted_edge_between_voxels_is_as_far_from_the_truth_as_one_at_them(device):
+    """A blur of 0.4 mm in voxels of 1 mm; interpolation half way between these adds 0.25 mm2, at them nothing."""
+    places = 8.0 + np.linspace(0.0, 1.0, 9)
+    errors = []
+    for place in places:
+        i = np.arange(20.0)
+        values = 50.0 + 950.0 * ndtr((place - i) / 0.4)
+        volume = Volume(np.broadcast_to(np.rint(values).astype(np.int16), (6, 6, 20)).copy(), np.eye(4))
+        with DeviceVolume(volume, device=device) as resident:
+            sampler = ProfileSampler(resident, Stopwatch())
+            profiles = sampler.take(sampler.values(np.array([[place + 0.5, 2.0, 2.0]]), np.array([[1.0, 0.0, 0.0]])))
+            errors.append(0.5 + float(profiles.fit(np.hypot(0.4, 0.41), 0.6, 1000.0, 10.0).shift_mm[0]))
+    assert np.abs(errors).max() < 0.06  # mm; measured 0.04, and 0.12 with the mean blur of interpolation at each place
+
+
+@pytest.mark.parametrize("blur", [0.3, 0.15], ids=lambda mm: f"blur {mm} mm")
+def test_errors_in_voxels_coarse_beside_the_blur_hold_the_distances_from_the_truth(device, blur):
+    """In voxels of 1 mm interpolation between them blurs by more than the scan does."""
+    mesh, fit = fit_surface(hollow_ball(thickness=3.0, blur=blur), device)
     away, rows = outer_places(mesh, fit)
-    assert (np.abs(away) < 1.96 * fit.error_mm[rows]).mean() > 0.95  # measured 1; 0.84 by the spread alone
-    assert (np.abs(away) < 1.96 * fit.spread_mm[rows]).mean() < 0.9  # measured 0.83
+    assert (np.abs(away) < 1.96 * fit.error_mm[rows]).mean() > 0.95  # measured 1; 0.82 by the spread alone
 
 
 def test_cubic_values_between_slices_find_walls_nearer_to_the_truth_than_linear_ones(device):
@@ -331,7 +346,7 @@ def plate(thickness: float) -> Volume:
 def test_walls_of_one_direction_have_one_blur_and_leave_the_other_unknown(device):
     """Searched for both, the blur within slices became 0.04 mm, with an error of 0.001 mm."""
     constants = fit_surface(plate(2.0), device)[1].constants
-    assert constants.blur_mm == constants.blur_across_mm == pytest.approx(0.6, abs=0.15)
+    assert constants.blur_mm == constants.blur_across_mm == pytest.approx(np.hypot(0.6, 0.4), abs=0.1)  # measured 0.76
     assert constants.blur_error_mm >= 0.4 * constants.blur_mm
 
 
@@ -370,7 +385,7 @@ def test_the_less_dense_of_two_bones_alone_has_a_cortex_of_its_own_where_compone
     """The cortex of the scan is that of the denser bone, which needs no other."""
     volume, mesh, is_second, _ = two_densities
     (own_cortex_hu,) = fit_components(device, volume, mesh, is_second).own_cortex_hu
-    assert own_cortex_hu == pytest.approx(900.0, rel=0.01)  # measured 904
+    assert own_cortex_hu == pytest.approx(900.0, rel=0.015)  # measured 911
 
 
 def test_no_bone_has_a_cortex_of_its_own_where_no_components_are_given(device, two_densities):
@@ -403,7 +418,8 @@ def test_profiles_half_a_millimetre_outside_of_a_wall_find_it(device):
     with DeviceVolume(hollow_ball(cortex=1000.0), device=device) as resident:
         sampler = ProfileSampler(resident, Stopwatch())
         profiles = sampler.take(sampler.values(points, directions))
-        walls = profiles.fit(blur_mm=0.75, across_mm=0.75, cortex_hu=1000.0, noise_hu=10.0)
+        blur_mm = float(np.hypot(0.7, 0.41))  # with that of the interpolation
+        walls = profiles.fit(blur_mm=blur_mm, across_mm=blur_mm, cortex_hu=1000.0, noise_hu=10.0)
     assert walls.shift_mm == pytest.approx([-0.5] * 3, abs=0.06)  # measured 0.03
 
 
