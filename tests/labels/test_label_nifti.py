@@ -161,7 +161,7 @@ def test_nifti_whose_sform_is_all_zeros_or_nan_is_refused(tmp_path, value, facts
 @pytest.mark.parametrize(
     ("field", "values", "message"),
     [
-        ("dim", (3, 32767, 32767, 32767, 1, 1, 1, 1), "at most 4,294,967,296 altogether"),
+        ("dim", (3, 32767, 32767, 32767, 1, 1, 1, 1), "at most 68,719,476,736 altogether"),
         ("dim", (3, 1600, 1600, 1600, 1, 1, 1, 1), "cannot come from a file of"),
         ("dim", (3, 30000, 30000, 2, 1, 1, 1, 1), "says that a slice has"),
         ("dim", (3, -7, 6, 4, 1, 1, 1, 1), "says that it has -7 x 6 x 4 voxels"),

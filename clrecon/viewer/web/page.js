@@ -199,7 +199,7 @@
     const [passed, judged] = scan.gates, words = passed === judged ? `geometry: ${judged} gates passed` : `${judged - passed} of ${judged} gates failed`;
     const chip = element("button", words, { type: "button", className: passed === judged ? "good" : "wrong",
       title: "the certificate of the scan", onclick: () => find("certificate").showModal() });
-    if (judged) find("chips").prepend(chip);
+    find("chips").replaceChildren(...(judged ? [chip] : []), find("offset"));
     find("certificate").firstElementChild.replaceChildren(...fixed.scans.flatMap(({ name, certificate }) => [
       element("h2", name), ...certificate.map((line) => element("p", line)),
     ]));
