@@ -42,7 +42,7 @@ def noise_surface(seed: int, shape: tuple[int, int, int] = (12, 12, 12), closed:
 
 
 def points_of(mesh: Mesh) -> np.ndarray:
-    """Points of each triangle and its edges, on a lattice: 45 of each where they are few, 6 of each of many small ones."""
+    """Points of each triangle and its edges, on a lattice: 45 where triangles are few, 6 where they are many."""
     steps = 8 if mesh.triangle_count <= MANY else 2
     weights = [(i, j, steps - i - j) for i in range(steps + 1) for j in range(steps + 1 - i)]
     corners = mesh.vertices[mesh.triangles].astype(float)
