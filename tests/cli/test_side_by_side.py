@@ -92,6 +92,14 @@ def test_mesh_and_report_are_the_same_with_other_threads_locale_time_zone_and_um
     assert read_output(plain) == read_output(odd)
 
 
+def test_trilinear_topology_may_be_that_of_the_first_surface_of_a_process(device, ct: Path, tmp_path: Path) -> None:
+    """Its kernels are built by themselves, while those of other meshes are built as one program."""
+    target = tmp_path / "trilinear.stl"
+    command = [sys.executable, "-m", "clrecon", "mesh", str(ct), "-o", str(target), "--device", str(device.index)]
+    done = subprocess.run([*command, "--topology", "trilinear", "-q"], timeout=300)
+    assert (done.returncode, target.exists()) == (0, True)
+
+
 @pytest.mark.fault_row(58)
 @pytest.mark.release
 @pytest.mark.seconds

@@ -219,7 +219,7 @@ def _try_levels(device: Device, settings: MeshSettings) -> list[Mesh]:
 def _load_together(device: Device, settings: MeshSettings) -> None:
     """Build the kernels of most meshes as one program: those of the surface, of its components, and of walls.
 
-    The trial run tells of a device that fails.
+    The trial run builds others, such as those of trilinear topology, and tells of a device that fails.
     """
     from clrecon.opencl import building_together
     from clrecon.operators.primitives.union_find import prepare_components
@@ -228,9 +228,8 @@ def _load_together(device: Device, settings: MeshSettings) -> None:
 
     with suppress(DeviceError), building_together(device.current):
         prepare_isosurface(
-            device.current, topology=settings.topology, inside=settings.inside, vertex_rule=settings.vertex_rule,
-            grown=bool(settings.grow_from),
-        )  # fmt: skip
+            device.current, inside=settings.inside, vertex_rule=settings.vertex_rule, grown=bool(settings.grow_from)
+        )
         if settings.selects:
             prepare_components(device.current)
         if settings.half_way != "auto":
