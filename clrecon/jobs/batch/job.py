@@ -68,8 +68,10 @@ def run_batch(
             check_files([("the table", root / TABLE), ("the page", root / PAGE)])
         waiting = [] if asked.collect else chosen
         if asked.retry:
-            waiting = [case for case in chosen if _find_status(case, plan) in asked.retry]
-            kept_count = len(chosen) - len(waiting)
+            earlier = [(case, _find_status(case, plan)) for case in chosen]
+            waiting = [case for case, status in earlier if status in asked.retry]
+            counts.update(status for _, status in earlier if status not in asked.retry)
+            kept_count = counts.total() - counts[MISSING]
         start = perf_counter()
         progress(_count_cases(0, len(waiting), None), 0, 0)
         scheduler: Scheduler = (

@@ -205,16 +205,25 @@ def test_retry_makes_refused_cases_again_and_leaves_done_ones_as_they_are(whole_
 
 
 @pytest.mark.seconds
-@pytest.mark.parametrize(("status", "made"), [("refused", 1), ("missing", 1), ("missing,refused", 2), ("failed", 0)])
-def test_retry_of_a_status_makes_the_cases_that_have_it(
-    whole_batch: Batch, printed: Any, status: str, made: int
+@pytest.mark.parametrize(
+    ("status", "made", "kept"), [("refused", 1, 3), ("missing", 1, 4), ("missing,refused", 2, 3), ("failed", 0, 4)]
+)
+def test_retry_of_a_status_makes_the_cases_that_have_it_and_keeps_those_that_are_there(
+    whole_batch: Batch, printed: Any, status: str, made: int, kept: int
 ) -> None:
     """Three are done, `gone` is refused, `later` has never run."""
     with (whole_batch.folder / "m.csv").open("a") as table:
         table.write("later,ball1\n")
     printed()
     assert whole_batch.run("--retry", status, "--json") == PARTLY_DONE
-    assert printed().report()["made"] == made
+    report = printed().report()
+    assert (report["made"], report["kept"]) == (made, kept)
+
+
+def test_retry_of_a_part_whose_cases_are_done_succeeds(whole_batch: Batch, printed: Any) -> None:
+    printed()
+    assert whole_batch.run("--retry", "--part", "1/4", "--json") == 0  # case A alone
+    assert printed().report()["statuses"] == {"done": 1}
 
 
 def test_collect_names_cases_that_were_not_made(whole_batch: Batch, printed: Any) -> None:
