@@ -105,6 +105,8 @@ class FileSystem:
             self._system, self._path = fsspec.core.url_to_fs(url)
         except (ValueError, ImportError) as error:
             raise UsageError(f"{self._name} cannot be opened: {escape_text(str(error), 120)}") from None
+        except OSError as error:  # of a server that is asked at once, such as that of ftp
+            raise _translate(self._name, type(error).__name__, str(error)) from None
 
     def list_entries(self, limits: Limits = Limits()) -> list[Entry]:  # noqa: B008 (a tuple)
         with foreign_errors(self._name):

@@ -295,6 +295,12 @@ def test_url_of_another_file_system_with_nothing_there_is_no_dicom(memory: Any) 
         read_volume("memory://none")
 
 
+def test_server_of_another_kind_that_does_not_answer_is_unreachable() -> None:
+    pytest.importorskip("fsspec")
+    with refused(UnreachableError, "ftp"):
+        read_volume("ftp://127.0.0.1:1/x")  # a port where nothing listens
+
+
 @pytest.mark.parametrize(("url", "package"), [("s3://a/b", "obstore"), ("sftp://a/b", "fsspec")])
 def test_package_that_a_url_needs_is_named_where_it_is_missing(
     url: str, package: str, monkeypatch: pytest.MonkeyPatch
