@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import pytest
+import tolerances
 import view_scenes as scenes
 from browser import wait_for
 from view_pages import SETTLED, open_view_page, run_command
@@ -159,7 +160,7 @@ def test_page_is_no_wider_than_a_narrow_window(page) -> None:
         page.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
 
-def test_two_fingers_that_move_apart_zoom_the_picture(page) -> None:
+def test_two_fingers_at_three_times_their_distance_zoom_the_picture_threefold(page) -> None:
     box, before = page.find_element("id", "scene").rect, page.execute_script("return clrecon.facts.camera.height_mm")
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
 
@@ -172,5 +173,7 @@ def test_two_fingers_that_move_apart_zoom_the_picture(page) -> None:
         touch("touchMove", half)
     touch("touchEnd")
 
-    wait_for(page, f"return clrecon.facts.camera.height_mm < {before / 2} && clrecon.facts.settled")
-    assert before / page.execute_script("return clrecon.facts.camera.height_mm") > 2.0  # a busy browser joins moves
+    near = f"{before} / clrecon.facts.camera.height_mm > {3.0 * (1.0 - tolerances.PAGE_TOUCH_ZOOM)}"  # of the last move
+    wait_for(page, f"return {near} && clrecon.facts.settled")
+    after = page.execute_script("return clrecon.facts.camera.height_mm")
+    assert before / after == pytest.approx(3.0, rel=tolerances.PAGE_TOUCH_ZOOM)
