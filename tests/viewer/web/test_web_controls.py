@@ -151,14 +151,17 @@ def test_each_control_that_is_seen_has_a_name_for_screen_readers(page) -> None:
 
 
 def test_page_is_no_wider_than_a_narrow_window(page) -> None:
-    size = {"width": 400, "height": 800, "deviceScaleFactor": 1, "mobile": True}
+    size = {"width": 400, "height": 800, "deviceScaleFactor": 1, "mobile": False}
+    fitted_mm = page.execute_script("return clrecon.facts.camera.height_mm")
     page.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
     try:
         wait_for(page, "return innerWidth === 400")
+        wait_for(page, f"return clrecon.facts.camera.height_mm < {0.9 * fitted_mm} && clrecon.facts.settled")
         assert page.execute_script("return document.documentElement.scrollWidth") == 400
     finally:
         page.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
-        wait_for(page, "return innerWidth !== 400")  # else the next page opens narrow and fits its picture again later
+        # Else the next page opens narrow, and fits its picture again while it is looked at.
+        wait_for(page, f"return Math.abs(clrecon.facts.camera.height_mm - {fitted_mm}) < 1e-6 && clrecon.facts.settled")
 
 
 def test_two_fingers_at_three_times_their_distance_zoom_the_picture_threefold(page) -> None:
