@@ -152,19 +152,18 @@ def test_each_control_that_is_seen_has_a_name_for_screen_readers(page) -> None:
 
 def test_page_is_no_wider_than_a_narrow_window(page) -> None:
     size = {"width": 400, "height": 800, "deviceScaleFactor": 1, "mobile": False}
-    fitted_mm = page.execute_script("return clrecon.facts.camera.height_mm")
     page.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
     try:
         wait_for(page, "return innerWidth === 400")
-        wait_for(page, f"return clrecon.facts.camera.height_mm < {0.9 * fitted_mm} && clrecon.facts.settled")
         assert page.execute_script("return document.documentElement.scrollWidth") == 400
     finally:
         page.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
-        # Else the next page opens narrow, and fits its picture again while it is looked at.
-        wait_for(page, f"return Math.abs(clrecon.facts.camera.height_mm - {fitted_mm}) < 1e-6 && clrecon.facts.settled")
+        wait_for(page, "return innerWidth !== 400")
 
 
 def test_two_fingers_at_three_times_their_distance_zoom_the_picture_threefold(page) -> None:
+    run_command(page, "look", view="left")  # the view of the start would be fitted anew to a window that changed
+    wait_for(page, "const f = clrecon.facts; return f.settled && f.camera.position[0] > f.bounds[1][0]")
     box, before = page.find_element("id", "scene").rect, page.execute_script("return clrecon.facts.camera.height_mm")
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
 
