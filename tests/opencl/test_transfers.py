@@ -6,17 +6,20 @@ numpy's memory."""
 from __future__ import annotations
 
 import gc
+import pickle
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 from counted_calls import counting_calls
+from refusals import refused
 
 import clrecon
+from clrecon.errors import DeviceLostError
 from clrecon.opencl import allocate, buffers, copy_buffer, download, download_all, upload
 from clrecon.opencl.quirks import import_pyopencl
 from clrecon.opencl.transfers import LEAST_BYTES, PIECE_BYTES, PIECES, PinnedPieces
-from clrecon.rendering.pictures.styles import Projection, VolumeLook
+from clrecon.rendering.pictures.styles import Projection, SlicesInSpace, SurfaceLook, VolumeLook
 
 
 @pytest.fixture
@@ -218,8 +221,8 @@ def test_surface_on_a_card_makes_no_more_calls_of_the_driver_than_counted_before
 @pytest.mark.parametrize(
     ("style", "launches", "uploads", "bytes_of_pixel"),
     [
-        pytest.param(VolumeLook("bone"), 3, 3, 4 + 4 + 4, id="volume: colours, first and mean depths"),
-        pytest.param(Projection("mip"), 1, 1, 4 + 4, id="mip: HU and depths"),
+        pytest.param(VolumeLook("bone"), 3, 3, 4, id="volume: colours"),
+        pytest.param(Projection("mip"), 1, 1, 4, id="mip: HU"),
     ],
 )  # enter_tiles, look_ahead and composite_rays; project_rays
 def test_picture_on_a_card_makes_no_more_calls_of_the_driver_than_counted_before(
@@ -235,6 +238,58 @@ def test_picture_on_a_card_makes_no_more_calls_of_the_driver_than_counted_before
     assert counts["blocking reads"] == 1
     assert counts["allocations"] == 0
     assert counts["blocking reads, bytes"] == bytes_of_pixel * 64 * 64
+
+
+STYLES = {
+    "volume": VolumeLook("bone"),
+    "surface": SurfaceLook(0.0),
+    "mip": Projection("mip"),
+    "slices in space": SlicesInSpace(),
+}
+
+
+@pytest.mark.seconds
+@pytest.mark.parametrize("style", STYLES.values(), ids=STYLES)
+def test_depths_that_are_asked_for_late_are_those_of_memory_of_the_host(device, card, monkeypatch, style):
+    """Another picture is taken and drops its own before."""
+    with clrecon.VolumeRenderer(make_ball(48), device=card) as renderer:
+        picture = renderer.render(style, view=(30, 30), size=(64, 64)).annotated(letters=True)
+        renderer.render(style, view=(120, 10), size=(64, 64))
+        with counting_calls() as counts:
+            depths = picture.depth, picture.expected_depth
+    assert counts["blocking reads"] == 1
+    monkeypatch.setattr(device, "shares_host_memory", True)
+    expected = clrecon.render(make_ball(48), style, view=(30, 30), size=(64, 64), device=device)
+
+    assert np.isfinite(expected.depth).any()
+    assert depths[0].tobytes() == expected.depth.tobytes()
+    assert depths[1].tobytes() == expected.expected_depth.tobytes()
+
+
+def test_pickled_picture_of_a_card_has_its_depths(card):
+    picture = clrecon.render(make_ball(48), "mip", size=(64, 64), device=card)
+    received = pickle.loads(pickle.dumps(picture))
+    assert np.array_equal(received.depth, picture.depth, equal_nan=True)
+
+
+def test_card_holds_the_depths_of_kept_pictures_up_to_64_mib(card):
+    with clrecon.VolumeRenderer(make_ball(48), device=card) as renderer:
+        kept = [renderer.render("dvr", size=(1000, 1000)) for _ in range(10)]
+    read = [not counted_reads(picture) for picture in kept]
+    assert read == 2 * [True] + 8 * [False]  # 8 MB each
+
+
+def counted_reads(picture):
+    with counting_calls() as counts:
+        assert picture.depth.shape == (1000, 1000)
+    return counts["blocking reads"]
+
+
+def test_depths_of_a_card_that_failed_are_an_error_that_names_it(card):
+    picture = clrecon.render(make_ball(48), "dvr", size=(64, 64), device=card)
+    card.give_up()
+    with refused(DeviceLostError, "depths"):
+        _ = picture.depth
 
 
 @pytest.mark.seconds

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+import threading
+import weakref
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.errors import DeviceLostError
 from clrecon.geometry import Volume, normal_matrix
 from clrecon.geometry.affine import Float64Array
 from clrecon.opencl import Device, Stopwatch, allocate, download_all, empty_output, kernel_constant
@@ -16,6 +19,7 @@ from clrecon.operators.resident.tables import FieldFrame
 from clrecon.rendering import Lighting
 from clrecon.rendering.looks.colors import find_color
 from clrecon.rendering.looks.lighting import LEAST_SOFT_GRADIENT
+from clrecon.rendering.pictures.picture import Depths
 from clrecon.rendering.views.camera import Camera, box_corners
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, ignore_progress
@@ -169,10 +173,6 @@ def count_queues(device: Device) -> int:
     return max(1, device.compute_units) if device.type == "cpu" else 1
 
 
-Pixels = tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]
-"""Image, depths and means."""
-
-
 class Shot(NamedTuple):
     """A picture that is asked for beside its look: from where, how large, before what."""
 
@@ -259,8 +259,55 @@ class PictureBuffers:
         width, height = self.size
         return -(-width // TILE) * -(-height // TILE)
 
-    def download(self, *, has_image: bool = True) -> Pixels:
-        """Wait for the device and return image, depths and means; an image that no kernel made is not brought."""
-        images = [(self.image, self.image_d, 0)] if has_image else []
-        download_all(self.device, *images, (self.depths, self.depths_d, 0), (self.means, self.means_d, 0))
-        return self.image, self.depths, self.means
+    def download_image(self) -> tuple[NDArray[np.uint8], LateDepths]:
+        """Wait for the device and return the image; depths and means stay on a card until they are wanted."""
+        download_all(self.device, (self.image, self.image_d, 0))
+        return self.image, LateDepths(self.device, (self.depths, self.depths_d), (self.means, self.means_d))
+
+    def download_means(self) -> tuple[NDArray[np.float32], LateDepths]:
+        """Wait for the device and return the means, which are values; first and mean depths are the same."""
+        download_all(self.device, (self.means, self.means_d, 0))
+        return self.means, LateDepths(self.device, (self.depths, self.depths_d))
+
+
+_MOST_LATE_BYTES = 64 << 20
+"""Bytes of late depths on a card: eight pictures of 1024 x 1024 pixels with both depths."""
+
+
+class LateDepths:
+    """Depths of a picture that a card holds until they are wanted; those of pictures that are gone are never read.
+
+    Other devices write them in the computer's memory.  Of pictures that somebody keeps, the card holds at most
+    `_MOST_LATE_BYTES`: the oldest are read before.
+    """
+
+    def __init__(self, device: Device, *wanted: tuple[NDArray[np.float32], Any]):
+        self._device, self._lock = device, threading.Lock()
+        self._arrays = [array for array, _ in wanted]
+        self._unread = [(array, array_d, 0) for array, array_d in wanted]
+        self._waiting = device.of_context(_list_waiting)
+        if device.shares_host_memory:
+            self()
+            return
+        with device.lock:
+            self._waiting.append(weakref.ref(self))
+            unread = [late for each in self._waiting if (late := each()) is not None and late._unread]
+            self._waiting[:] = map(weakref.ref, unread)
+        sizes = [sum(array.nbytes for array in late._arrays) for late in unread]
+        for number, late in enumerate(unread):
+            if sum(sizes[number:]) > _MOST_LATE_BYTES:
+                late()
+
+    def __call__(self) -> Depths:
+        """Return first and mean depths, after reading them if they were not read before."""
+        with self._lock:
+            if self._unread and self._device.of_context(_list_waiting) is not self._waiting:
+                raise DeviceLostError(f"{self._device.label} failed before the depths of the picture were asked for")
+            download_all(self._device, *self._unread)
+            self._unread = []
+        first, *mean = self._arrays
+        return first, mean[0] if mean else first.copy()
+
+
+def _list_waiting(device: Device) -> list[weakref.ref[LateDepths]]:
+    return []

@@ -21,6 +21,7 @@ from clrecon.operators.rays.picture_buffers import (
     NEAR_ROW,
     Between,
     DrawnVolume,
+    LateDepths,
     PictureBuffers,
     RayView,
     Shot,
@@ -38,6 +39,7 @@ from clrecon.rendering.looks.window import (
     choose_window,
     grey_image,
 )
+from clrecon.rendering.pictures.picture import Depths
 from clrecon.rendering.pictures.styles import Projection, VolumeLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.system.light_dataclass import dataclass
@@ -268,7 +270,6 @@ class _Job(ray_slabs.SlabPicture):
         label_style = style.label_style if isinstance(style, VolumeLook) else None
         super().__init__(resident, shot, ray_step, label_style, warnings)
         self.style = style
-        self.makes_image = isinstance(style, VolumeLook)  # those of projections are made of their values
         self.lighting = style.light if isinstance(style, VolumeLook) else Lighting()
         self.box = volume_box(resident.volume)
         self.planes = None if style.clip is None else style.clip.planes
@@ -305,13 +306,18 @@ class _Job(ray_slabs.SlabPicture):
     def take(self, slices: int) -> Rendering:
         style = self.style
         self.find_openness(slices)
-        (image, depths, means), slabs = self.draw_slabs(slices)
+        output, slabs = self.draw_slabs(slices)
+        with self.stopwatch.timed("download"):
+            if isinstance(style, Projection):
+                values, late = output.download_means()
+            else:
+                image, late = output.download_image()
         report = self.describe(style.mode, slabs)
         if isinstance(style, Projection):
-            return self._finish_projection(style, means, depths, report)
+            return self._finish_projection(style, values, late, report)
         report["unit_distance_mm"] = style.function.unit_distance
         report["smooth_light_mm"] = 0.0 if self.smoothing is None else self.smoothing.sigma_mm
-        return Rendering(image, depths, means, self.shot.camera, None, style.mode, report)
+        return Rendering.with_late_depths(late, image, self.shot.camera, None, style.mode, report)
 
     def draw(self, slab: ray_slabs.RaySlab, output: PictureBuffers) -> None:
         if isinstance(self.style, VolumeLook):
@@ -381,15 +387,16 @@ class _Job(ray_slabs.SlabPicture):
             )  # fmt: skip
 
     def _finish_projection(
-        self, style: Projection, values: NDArray[np.float32], depths: NDArray[np.float32], report: dict[str, Any]
+        self, style: Projection, values: NDArray[np.float32], late: LateDepths, report: dict[str, Any]
     ) -> Rendering:
         is_water = style.kind == "drr"
         volume = self.resident.volume
+        empty: NDArray[np.bool_] | None = None
         if style.leaves_out and LEFT_OUT in volume.report:
             left_out = self.resident.keep("left out", None, 0, lambda: count_left_out(volume))
             assert left_out is not None
             empty = ~(values <= volume.report[LEFT_OUT]["highest_hu"])
-            values[empty] = depths[empty] = np.nan
+            values[empty] = np.nan
             report["left_out"] = left_out
             if not left_out["body"]:
                 report["warnings"].append(_NO_BODY)
@@ -399,7 +406,14 @@ class _Job(ray_slabs.SlabPicture):
         image = grey_image(values, window)
         if is_water:
             image[values <= 0.0, 3] = 0  # nothing attenuates there, inside the volume or beside it
-        rendering = Rendering(image, depths, depths.copy(), self.shot.camera, values, style.kind, report)
+
+        def read_depths() -> Depths:
+            depths = late()
+            if empty is not None:
+                depths[0][empty] = depths[1][empty] = np.nan
+            return depths
+
+        rendering = Rendering.with_late_depths(read_depths, image, self.shot.camera, values, style.kind, report)
         return rendering if self.shot.background is None else rendering.with_background(self.shot.background)
 
     def _view(self, focus: tuple[Float64Array, Float64Array]) -> RayView:

@@ -17,7 +17,7 @@ from clrecon.geometry.affine import Float64Array
 from clrecon.labels import ResampledLabels
 from clrecon.labels.label_levels import Growth
 from clrecon.opencl import Stopwatch, allocate, check_budget, download, kernel_constant, launch, load_program, upload
-from clrecon.operators.rays.picture_buffers import PictureBuffers, Pixels, Shot
+from clrecon.operators.rays.picture_buffers import PictureBuffers, Shot
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.tables import BOX_BORDER, enclose, label_variants, voxel_variants
 from clrecon.rendering import Rendering
@@ -380,7 +380,6 @@ def _find_box(volume: Volume, marked: NDArray[np.bool_], slab: RaySlab) -> tuple
 class SlabPicture(ABC):
     """A picture of a volume whose slabs are drawn one after the other."""
 
-    makes_image = True
     smoothing: Smoothing | None = None
     beside: Mapping[str, int] = MappingProxyType({})
     """Bytes on the device of what is made for the picture beside its slabs."""
@@ -415,8 +414,8 @@ class SlabPicture(ABC):
         entry_k = entry_slice(self.resident.volume, self.shot.camera)
         return ray_slabs(self.resident, slices, entry_k, self.stopwatch, self.smoothing)
 
-    def draw_slabs(self, slices: int) -> tuple[Pixels, int]:
-        """Return image, depths and means, and the number of slabs."""
+    def draw_slabs(self, slices: int) -> tuple[PictureBuffers, int]:
+        """Return the drawn picture, still on the device, and the number of slabs."""
         nk = self.resident.volume.shape_ijk[2]
         tell = self.shot.progress
         number = 0
@@ -426,8 +425,7 @@ class SlabPicture(ABC):
             number += 1
             self.draw(slab, output)
             tell("slabs", min(number * slices, nk), nk)
-        with self.stopwatch.timed("download"):
-            return output.download(has_image=self.makes_image), number
+        return output, number
 
     def describe(self, mode: str, slabs: int, **facts: Any) -> dict[str, Any]:
         device = self.resident.device

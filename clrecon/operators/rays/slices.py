@@ -181,7 +181,7 @@ class _Overlay:
             self._draw(part, (number == 0) + 2 * (number == len(parts) - 1), output)
             self.shot.progress("slabs", min((number + 1) * slices, len(self.order)), len(self.order))
         with stopwatch.timed("download"):
-            image, depths, means = output.download()
+            image, late = output.download_image()
         report = {
             "mode": "slices",
             "device": device.label,
@@ -193,7 +193,7 @@ class _Overlay:
             "kernel_seconds": dict(stopwatch.by_kernel),
             "warnings": [*device.warnings, *self.warnings],
         }
-        return Rendering(image, depths, means, self.view.camera, None, "slices", report)
+        return Rendering.with_late_depths(late, image, self.view.camera, None, "slices", report)
 
     def _draw(self, part: Sequence[int], stage: int, output: PictureBuffers, between: Between | None = None) -> None:
         """Draw slices in the given order, and wait."""

@@ -93,9 +93,11 @@ class _Job(SlabPicture):
                 )
             self._shorten_steps()
         self._find_openness(slices)
-        pixels, slabs = self.draw_slabs(slices)
+        output, slabs = self.draw_slabs(slices)
+        with self.stopwatch.timed("download"):
+            image, late = output.download_image()
         report = self.describe("surface", slabs, iso_value_hu=self.rule.iso_value)
-        return Rendering(*pixels, self.shot.camera, None, "surface", report)
+        return Rendering.with_late_depths(late, image, self.shot.camera, None, "surface", report)
 
     def _shorten_steps(self) -> None:
         """Limit the step to a slice, because a slab holds only one slice before its own."""

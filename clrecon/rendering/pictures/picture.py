@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from html import escape
 from io import BytesIO
 from typing import Any, Literal
@@ -21,6 +21,11 @@ from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.paths import find_extension, keep_existing
 from clrecon.version import package_version
 
+Depths = tuple[NDArray[np.float32], NDArray[np.float32]]
+"""First and expected depths, (h, w) mm."""
+
+_NO_DEPTHS: Depths = (np.empty((0, 0), np.float32), np.empty((0, 0), np.float32))
+
 
 @dataclass
 class Rendering(PictureData):
@@ -31,7 +36,8 @@ class Rendering(PictureData):
     image : ndarray, shape (h, w, 4), uint8
         Red, green, blue and opacity, not premultiplied; row 0 is the top.
     depth : ndarray, shape (h, w), float32
-        Distance along the ray to the first hit in mm, see ``Camera.position``; NaN where nothing is hit.
+        Distance along the ray to the first hit in mm, see ``Camera.position``; NaN where nothing is hit.  A graphics
+        card may keep both depths until one of them is asked for: if the card fails before, this is a `DeviceError`.
     expected_depth : ndarray, shape (h, w), float32
         Mean distance in mm of all samples of the pixel, weighted with what each adds to the pixel; NaN in empty pixels.
     camera : Camera or None
@@ -50,6 +56,37 @@ class Rendering(PictureData):
     def __repr__(self) -> str:
         width, height = self.size
         return f"Rendering({self.mode}, {width} x {height} pixels)"
+
+    @classmethod
+    def with_late_depths(cls, read_depths: Callable[[], Depths], image: NDArray[np.uint8], *more: Any) -> Rendering:
+        """Return a picture that calls ``read_depths`` when a depth is asked for; ``more`` begins with the camera.
+
+        It gives ``depth`` and ``expected_depth``, every time the same, and an error of its device.
+        """
+        picture = cls(image, *_NO_DEPTHS, *more)
+        del picture.depth, picture.expected_depth
+        vars(picture)["_read_depths"] = read_depths
+        return picture
+
+    def __getattr__(self, name: str) -> Any:
+        """Read the depths at their first use; one that was set in the meantime stays."""
+        if name not in ("depth", "expected_depth") or "_read_depths" not in vars(self):
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        for field, depths in zip(("depth", "expected_depth"), vars(self)["_read_depths"](), strict=True):
+            vars(self).setdefault(field, depths)
+        return vars(self)[name]
+
+    def __getstate__(self) -> dict[str, object]:
+        _ = self.depth, self.expected_depth  # read them: buffers stay with their process
+        return super().__getstate__()
+
+    _UNSENT = ("_read_depths",)
+
+    def _with(self, **changes: Any) -> Rendering:
+        """Return the picture with other values of fields; what is still on the device stays there."""
+        picture = object.__new__(type(self))
+        vars(picture).update(vars(self) | changes)
+        return picture
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
         """Return ``image``, for numpy and for ``matplotlib.pyplot.imshow(rendering)``."""
@@ -122,10 +159,9 @@ class Rendering(PictureData):
         from clrecon.rendering.looks.colors import find_color
 
         if self.drawing is not None:
-            below = replace(self, image=self.drawing.ground, drawing=None).with_background(color).image
-            return replace(
-                replace(self, drawing=None).with_background(color), drawing=Drawing(below, self.drawing.marks)
-            )
+            below = self._with(image=self.drawing.ground, drawing=None).with_background(color).image
+            drawing = Drawing(below, self.drawing.marks)
+            return self._with(drawing=None).with_background(color)._with(drawing=drawing)
         behind = (255.0 * find_color(color)).astype(np.float32)
         alone = np.array([*np.rint(behind), 255], np.uint8).view(np.uint32)
         opacity = self.image[..., 3]
@@ -135,7 +171,7 @@ class Rendering(PictureData):
         share = self.image[mixed, 3:].astype(np.float32) / np.float32(255.0)
         image[mixed, :3] = np.rint(share * self.image[mixed, :3] + (np.float32(1.0) - share) * behind)
         image[..., 3] = 255
-        return replace(self, image=image)
+        return self._with(image=image)
 
     @explains_arguments
     def annotated(
@@ -156,8 +192,8 @@ class Rendering(PictureData):
         resolution = None if dpi is None else checked_dpi(dpi)
         image, drawing = annotate(self, letters=letters, scale_bar=scale_bar, caption=caption, dpi=resolution)
         if resolution is not None:
-            return replace(self, image=image, drawing=drawing, report={**self.report, "dpi": resolution})
-        return self if image is self.image else replace(self, image=image, drawing=drawing)
+            return self._with(image=image, drawing=drawing, report={**self.report, "dpi": resolution})
+        return self if image is self.image else self._with(image=image, drawing=drawing)
 
     @explains_arguments
     def save(self, path: str | os.PathLike[str], *, quality: int = 95, no_clobber: bool = False) -> int:

@@ -24,7 +24,7 @@ from clrecon.rendering.pictures.styles import CurveCut, Projection, SlicesInSpac
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.directions import as_point, checked_size
 from clrecon.rendering.views.reformation import find_plane
-from clrecon.system.light_dataclass import dataclass, replace
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress
 from clrecon.viewer.drawing.looks import LEAST_OPACITY, LabelledLook, Looks, to_voxels
 from clrecon.viewer.drawing.shown_meshes import divide_surface, make_meshes
@@ -387,13 +387,16 @@ def join_sides(pictures: Sequence[Rendering], state: ViewState) -> Rendering:
     left, right = pictures
     assert state.compare is not None
     column = round(state.compare * left.size[0])
-    joined: dict[str, Any] = {
-        name: np.concatenate([getattr(left, name)[:, :column], getattr(right, name)[:, column:]], axis=1)
-        for name in ("image", "depth", "expected_depth")
-    }
+
+    def join_field(name: str) -> NDArray[Any]:
+        return np.concatenate([getattr(left, name)[:, :column], getattr(right, name)[:, column:]], axis=1)
+
     warnings = dict.fromkeys([*left.report["warnings"], *right.report["warnings"]])
     report = {**right.report, **left.report, "warnings": list(warnings)}
-    return replace(left, values=None, report=report, **joined)
+    image = join_field("image")
+    return Rendering.with_late_depths(
+        lambda: (join_field("depth"), join_field("expected_depth")), image, left.camera, None, left.mode, report
+    )
 
 
 def _key_of(labelled: LabelledLook, number: int) -> str | None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -62,13 +61,16 @@ def take_strips(
         shift = (0.5 * height - 0.5 * (first + end)) * pixel * up
         strip_camera = shift_camera(camera, shift, parallel_scale=0.5 * (end - first) * pixel)
         strips.append(take(strip_camera, (width, end - first)))
-    joined: dict[str, Any] = {
-        name: np.concatenate([getattr(strip, name) for strip in strips])
-        for name in ("image", "depth", "expected_depth", "values")
-        if getattr(strips[0], name) is not None
-    }
+
+    def join_field(name: str) -> NDArray[Any]:
+        return np.concatenate([getattr(strip, name) for strip in strips])
+
+    values = None if strips[0].values is None else join_field("values")
     report = {**strips[-1].report, "strips": len(strips)}
-    return replace(strips[0], camera=camera, report=report, **joined)
+    image = join_field("image")
+    return Rendering.with_late_depths(
+        lambda: (join_field("depth"), join_field("expected_depth")), image, camera, values, strips[0].mode, report
+    )
 
 
 SIDE = 20
