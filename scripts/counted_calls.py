@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from clrecon.opencl import arrays, buffers
+from clrecon.opencl import Landed, arrays, buffers
 from clrecon.opencl.device import Commands, Device
 from clrecon.opencl.program import Kernel
 from clrecon.opencl.quirks import import_pyopencl
@@ -36,9 +36,9 @@ def counting_calls() -> Iterator[Counter[str]]:
             count("uploads", size)
         return ask(device, flags, size, host)
 
-    def write_counted(device: Device, array: Any, array_d: Any) -> None:
+    def write_counted(device: Device, array: Any, array_d: Any, landed: Landed | None = None) -> None:
         count("uploads", array.nbytes)
-        write(device, array, array_d)
+        write(device, array, array_d, landed)
 
     def fill_counted(device: Device, wanted: Sequence[Any]) -> None:
         count("blocking reads", sum(array.nbytes for array, _, _ in wanted))

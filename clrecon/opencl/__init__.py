@@ -31,3 +31,4 @@ from clrecon.opencl.select import (
     with_fallback,
 )
 from clrecon.opencl.sources import kernel_constant, kernel_files, kernel_number, read_kernel_source
+from clrecon.opencl.transfers import Landed

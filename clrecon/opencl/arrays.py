@@ -25,7 +25,7 @@ from clrecon.opencl.buffers import raw
 from clrecon.opencl.device import Device, describe_error, kind_of_error
 from clrecon.opencl.launching import wait
 from clrecon.opencl.quirks import import_pyopencl
-from clrecon.opencl.transfers import LEAST_BYTES, read_buffers, write_buffer
+from clrecon.opencl.transfers import LEAST_BYTES, Landed, read_buffers, write_buffer
 from clrecon.system.arguments import name_parameter
 from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.memory import aligned_empty
@@ -248,10 +248,11 @@ def allocate(device: Device, size: int) -> Any:
     return _make_buffer(device, cl.mem_flags.READ_WRITE, max(size, 4))
 
 
-def upload(device: Device, array: NDArray[Any], *, writable: bool = False) -> Any:
+def upload(device: Device, array: NDArray[Any], *, writable: bool = False, landed: Landed | None = None) -> Any:
     """Return a buffer with the contents of `array`, which must not change while the buffer is used.
 
-    Kernels may write to a `writable` buffer alone; the array does not get what they write.
+    Kernels may write to a `writable` buffer alone; the array does not get what they write.  `landed` is that of
+    `write_buffer`; where the array is used in place, or is small, it is not called.
     """
     cl = import_pyopencl()
     array = np.ascontiguousarray(array)
@@ -263,7 +264,7 @@ def upload(device: Device, array: NDArray[Any], *, writable: bool = False) -> An
         return _make_buffer(device, flags | cl.mem_flags.COPY_HOST_PTR, array.nbytes, array)
     array_d = _make_buffer(device, flags, array.nbytes)
     try:
-        write_buffer(device, array, array_d)
+        write_buffer(device, array, array_d, landed)
     except cl.Error as error:
         raise device.fail("writing failed", error) from error
     return array_d

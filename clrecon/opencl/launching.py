@@ -179,11 +179,15 @@ class Stopwatch:
 
     @contextmanager
     def timed(self, part: str) -> Iterator[None]:
-        """Add the wall time of the block to `part`."""
+        """Add the wall time of the block to `part`; kernels that it launches count in the next `running` block."""
         start = time.perf_counter()
+        outer = _running.get()
+        _running.set(self)
         try:
             yield
         finally:
+            if _running.get() is self:
+                _running.set(outer)
             self.seconds[part] += time.perf_counter() - start
 
     def record(self, kernel: str, event: Any) -> None:
@@ -232,11 +236,14 @@ _running: ContextVar[Stopwatch | None] = ContextVar("running", default=None)
 """The stopwatch in whose `running` block this thread is."""
 
 
-def launch(device: Device, kernel: Kernel, items: int, most: int | None = None, /, **arguments: Any) -> None:
+def launch(
+    device: Device, kernel: Kernel, items: int, most: int | None = None, begin: int = 0, /, **arguments: Any
+) -> None:
     """Enqueue `kernel` over at least `items` work-items; the stopwatch that is running has its time.
 
     items: Rounded up to whole groups of `Device.group_size`, so kernels check their bounds first.
     most: Items of a launch; if there are more, several follow each other.
+    begin: Number of the first item.
     **arguments: The kernel's arguments, by their names in its source: buffers, numbers, and four numbers for a float4.
         Numbers are converted to the types in the source.
     """
@@ -252,7 +259,7 @@ def launch(device: Device, kernel: Kernel, items: int, most: int | None = None, 
         try:
             with device.lock:
                 queue = device.queue
-                event = kernel.enqueue(queue, min(part, rounded - first), group, values, first)
+                event = kernel.enqueue(queue, min(part, rounded - first), group, values, begin + first)
                 device.commands.add(f"kernel {kernel.name}", event, queue, values, arguments)
                 if part < rounded:
                     queue.flush()  # what a driver sends together counts as one for watchdogs

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import threading
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -107,8 +107,15 @@ def _ranges(size: int) -> Iterator[tuple[int, int]]:
         yield start, min(start + PIECE_BYTES, size)
 
 
-def write_buffer(device: Device, array: NDArray[Any], array_d: Any) -> None:
-    """Copy a C-contiguous array into a buffer, for all later commands; the array may change afterwards."""
+Landed = Callable[[Any, int], None]
+"""Called with a buffer and with how many of its bytes are there for all commands that follow."""
+
+
+def write_buffer(device: Device, array: NDArray[Any], array_d: Any, landed: Landed | None = None) -> None:
+    """Copy a C-contiguous array into a buffer, for all later commands; the array may change afterwards.
+
+    landed: Called after each of several pieces, so that kernels work while the next pieces come.
+    """
     cl = import_pyopencl()
     source, action = _bytes_of(array), f"the transfer of {array.nbytes:,} bytes to the device"
     if array.nbytes < LEAST_BYTES:
@@ -132,6 +139,8 @@ def write_buffer(device: Device, array: NDArray[Any], array_d: Any) -> None:
             piece.command = device.commands.add(action, event, queue, array_d, piece)
         piece.is_taken = False
         queue.flush()
+        if landed is not None:
+            landed(array_d, end)
 
     with pinned.lock:
         for start, end in _ranges(source.nbytes):

@@ -80,7 +80,7 @@ def _compare_components(
     from clrecon.geometry.iso_rule import choose_iso_rule
     from clrecon.opencl import Stopwatch
     from clrecon.operators.surface.growing import find_components
-    from clrecon.operators.surface.marching_cubes import classify
+    from clrecon.operators.surface.marching_cubes import Classifier
     from clrecon.operators.surface.slabs import SampleGrid, Slab
 
     volume = resident.volume
@@ -89,7 +89,7 @@ def _compare_components(
     level = volume.voxels.dtype.type(rule.lowest_inside)
     slab = Slab(grid, 0, grid.shape[2])
     with watch.running(job.device):
-        classified = classify(job.device, slab, resident.whole(watch), (level,))
+        classified = Classifier(job.device, slab, (level,)).mark_rest(resident.whole(watch))
     mask = volume.voxels >= job.hu
     own = find_components(resident, grid, classified, watch)
     peers: dict[str, Callable[[], Any]] = {

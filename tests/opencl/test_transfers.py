@@ -216,6 +216,28 @@ def test_surface_on_a_card_makes_no_more_calls_of_the_driver_than_counted_before
     assert counts["blocking reads, bytes"] <= totals + arrays
 
 
+@pytest.mark.parametrize("memory", [None, 32 << 20], ids=["whole", "in slabs"])
+def test_samples_of_a_surface_on_a_card_are_marked_while_voxels_come(device, card, monkeypatch, memory):
+    axis = np.arange(512, dtype=np.int16) - 256
+    voxels = 200 - abs(axis[:, None]) - abs(axis) + 2 * np.arange(72, dtype=np.int16)[:, None, None]
+    volume = clrecon.Volume(voxels, np.diag((0.7, 0.5, 2.5, 1.0)))
+    assert volume.voxels.nbytes == 36 << 20  # two launches of the first pass for 16 MiB each, one for the rest
+
+    def extract():
+        mesh = clrecon.extract_isosurface(volume, 100.0, device=device, memory=memory)
+        return mesh.report, b"".join(array.tobytes() for array in (mesh.vertices, mesh.normals, mesh.triangles))
+
+    with counting_calls() as counts:
+        report, mesh = extract()
+    monkeypatch.setattr(card, "shares_host_memory", True)
+    with counting_calls() as expected_counts:
+        _, expected = extract()
+    assert mesh == expected
+    assert "classify_samples" in report["kernel_seconds"]
+    if memory is None:
+        assert counts["launches"] == expected_counts["launches"] + 2
+
+
 @pytest.mark.seconds
 @pytest.mark.every_device
 @pytest.mark.parametrize(

@@ -147,18 +147,18 @@ class DeviceVolume(Closing, Volume):
         self._check_context()
         return self._whole_d is not None
 
-    def whole(self, stopwatch: Stopwatch) -> Any:
+    def whole(self, stopwatch: Stopwatch, landed: ocl.Landed | None = None) -> Any:
         """Return all voxels on the device, (nk, nj, ni); they stay there."""
         with self._lock:
             self._check_context()
             if self._whole_d is None:
-                self._whole_d = self.upload(self.volume.voxels, stopwatch)
+                self._whole_d = self.upload(self.volume.voxels, stopwatch, landed)
             return self._whole_d
 
-    def part(self, first: int, end: int, stopwatch: Stopwatch) -> Any:
+    def part(self, first: int, end: int, stopwatch: Stopwatch, landed: ocl.Landed | None = None) -> Any:
         """Return slices ``first`` to ``end - 1`` on the device, replacing all other voxels there."""
         self.make_way()
-        part_d = self.upload(self.volume.voxels[first:end], stopwatch)
+        part_d = self.upload(self.volume.voxels[first:end], stopwatch, landed)
         self._part_bytes += self.volume.voxels[first:end].nbytes
         return part_d
 
@@ -178,10 +178,10 @@ class DeviceVolume(Closing, Volume):
         ni, nj, _ = self.volume.shape_ijk
         return ni * nj * int(self.dtype.itemsize)
 
-    def upload(self, voxels: NDArray[Any], stopwatch: Stopwatch) -> Any:
+    def upload(self, voxels: NDArray[Any], stopwatch: Stopwatch, landed: ocl.Landed | None = None) -> Any:
         """Upload voxels of this volume, in any order and number."""
         with stopwatch.timed("upload"):
-            voxels_d = ocl.upload(self.device, voxels)
+            voxels_d = ocl.upload(self.device, voxels, landed=landed)
         self.uploaded_bytes += voxels.nbytes
         return voxels_d
 

@@ -274,13 +274,19 @@ class Extraction:
         slabs = (Slab(self.grid, first, min(first + slices, gk)) for first in range(0, gk, slices))
         with self.stopwatch.running(self.device):
             classified = join_slabs(
-                self.resident, self.grid, ((slab, self._classify(slab, self._upload_part(slab))) for slab in slabs)
+                self.resident, self.grid, ((slab, self._classify(slab, *self._bring(slab))) for slab in slabs)
             )
             self._grown = grow(self.resident, self.grid, classified, seeds)
 
-    def _classify(self, slab: Slab, voxels_d: Any) -> Classified:
-        bricks = self._compare_bricks(slab, voxels_d)
-        return marching_cubes.classify(self.device, slab, voxels_d, self.levels, bricks)
+    def _bring(self, slab: Slab) -> tuple[Any, marching_cubes.Classifier]:
+        """Return the slab's voxels on the device, and its samples, which a card has marked as their voxels came."""
+        classifier = marching_cubes.Classifier(self.device, slab, self.levels)
+        if slab.is_whole:
+            return self.resident.whole(self.stopwatch, classifier.mark_landed), classifier
+        return self.resident.part(*slab.voxel_slices, self.stopwatch, classifier.mark_landed), classifier
+
+    def _classify(self, slab: Slab, voxels_d: Any, classifier: marching_cubes.Classifier) -> Classified:
+        return classifier.mark_rest(voxels_d, self._compare_bricks(slab, voxels_d))
 
     def _add_slab(self, slab: Slab) -> None:
         """Make the part of the surface that belongs to a slab."""
@@ -309,21 +315,18 @@ class Extraction:
     def _find_part(self, slab: Slab) -> tuple[Counted, Any]:
         """Find and count the part of the surface that belongs to a slab; return the slab's voxels too."""
         device, stopwatch = self.device, self.stopwatch
-        voxels_d = self.resident.whole(stopwatch) if slab.is_whole else self._upload_part(slab)
+        voxels_d, classifier = self._bring(slab)
         with stopwatch.running(device):
             if self._grown is not None and slab.is_whole:
                 classified = self._grown.classified
             else:
-                classified = self._classify(slab, voxels_d)
+                classified = self._classify(slab, voxels_d, classifier)
             if self._seeds is not None:
                 if self._grown is None:
                     self._grown = grow(self.resident, self.grid, classified, self._seeds)
                 classified = self._grown.part(classified, slab.first)
             counted = count(device, slab, classified, voxels_d)
         return replace(counted, triangles=0) if self._vertices_only else counted, voxels_d
-
-    def _upload_part(self, slab: Slab) -> Any:
-        return self.resident.part(*slab.voxel_slices, self.stopwatch)
 
     def _compare_bricks(self, slab: Slab, voxels_d: Any) -> BrickStates | None:
         """Compare the bricks of a whole volume with the only level; None if measuring them is not worth it yet.

@@ -274,32 +274,70 @@ class Placement:
         return positions if self.origin is None else positions + self.origin
 
 
-def classify(
-    device: Device, slab: Slab, voxels_d: Any, levels: Sequence[Any], bricks: BrickStates | None = None
-) -> Classified:
-    """Pass 1: mark the samples of the slab that are inside; for a rule that encloses values below, those that are not.
+_LANDED_BYTES = 1 << 24
+"""Bytes that come between two launches of the first pass, which take the host little time beside their copies."""
 
-    voxels_d: Slices ``slab.voxel_slices`` of the volume.
+
+class Classifier:
+    """Pass 1: marks the samples of the slab that are inside; for a rule that encloses values below, those that are not.
+
     levels: Lowest inside value and, of a range, the highest.
-    bricks: The comparison of the volume's bricks with the only level, if the slab is the whole volume.
     """
-    program = prepare_classify(device, slab.grid.volume.voxels.dtype, slab.grid.rule.inside)
-    mask_d = ocl.allocate(device, 4 * slab.mask_rows * slab.grid.words)
-    row_extents_d = ocl.allocate(device, 4 * slab.mask_rows)
-    if bricks is not None:
-        (ni, nj, nk), border = slab.grid.volume.shape_ijk, slab.grid.rule.border
+
+    def __init__(self, device: Device, slab: Slab, levels: Sequence[Any]):
+        self.slab, self._device = slab, device
+        self._levels = levels
+        self._program = prepare_classify(device, slab.grid.volume.voxels.dtype, slab.grid.rule.inside)
+        self._marked_rows = self._landed_bytes = 0
+
+    @cached_property
+    def _marked(self) -> Classified:
+        rows = self.slab.mask_rows
+        return Classified(*(ocl.allocate(self._device, 4 * size) for size in (rows * self.slab.grid.words, rows)))
+
+    def mark_landed(self, voxels_d: Any, size: int) -> None:
+        """Mark the rows of slices that are within the first `size` bytes of the voxels, which are on the device."""
+        if size - self._landed_bytes < _LANDED_BYTES:
+            return
+        self._landed_bytes = size
+        grid, (first, _) = self.slab.grid, self.slab.voxel_slices
+        (ni, nj, _), border = grid.volume.shape_ijk, grid.rule.border
+        sample_slice = first + size // (ni * nj * grid.volume.voxels.itemsize) + border
+        rows = (sample_slice - self.slab.first) * grid.shape[1]
+        group = self._device.group_size
+        self._mark_rows(voxels_d, min(rows, self.slab.mask_rows) // group * group)
+
+    def _mark_rows(self, voxels_d: Any, end: int) -> None:
+        """Mark the rows before `end` that are not marked yet."""
+        begin = self._marked_rows
+        if end <= begin:
+            return
+        levels = self._levels
+        bounds = {"level": levels[0]} if len(levels) == 1 else {"level": levels[0], "highest": levels[1]}
         ocl.launch(
-            device, program["classify_bricks"], slab.mask_rows,
-            word_states=bricks.states_d, word_extents=bricks.extents_d, voxels=voxels_d, mask=mask_d,
-            row_extents=row_extents_d, level=levels[0], ni=ni, nj=nj, nk=nk, border=border, words=slab.grid.words,
+            self._device, self._program["classify_samples"], end - begin, None, begin, voxels=voxels_d,
+            mask=self._marked.mask_d, row_extents=self._marked.row_extents_d, **bounds, **self.slab.arguments,
         )  # fmt: skip
-        return Classified(mask_d, row_extents_d)
-    bounds = {"level": levels[0]} if len(levels) == 1 else {"level": levels[0], "highest": levels[1]}
-    ocl.launch(
-        device, program["classify_samples"], slab.mask_rows,
-        voxels=voxels_d, mask=mask_d, row_extents=row_extents_d, **bounds, **slab.arguments,
-    )  # fmt: skip
-    return Classified(mask_d, row_extents_d)
+        self._marked_rows = end
+
+    def mark_rest(self, voxels_d: Any, bricks: BrickStates | None = None) -> Classified:
+        """Mark all rows that are not marked yet.
+
+        voxels_d: Slices ``slab.voxel_slices`` of the volume.
+        bricks: The comparison of the volume's bricks with the only level, if the slab is the whole volume.
+        """
+        slab, marked = self.slab, self._marked
+        if bricks is None:
+            self._mark_rows(voxels_d, slab.mask_rows)
+        else:
+            (ni, nj, nk), border = slab.grid.volume.shape_ijk, slab.grid.rule.border
+            ocl.launch(
+                self._device, self._program["classify_bricks"], slab.mask_rows,
+                word_states=bricks.states_d, word_extents=bricks.extents_d, voxels=voxels_d, mask=marked.mask_d,
+                row_extents=marked.row_extents_d, level=self._levels[0], ni=ni, nj=nj, nk=nk, border=border,
+                words=slab.grid.words,
+            )  # fmt: skip
+        return marked
 
 
 def too_many(vertices: int, triangles: int) -> DeviceError:

@@ -8,7 +8,7 @@ from surface_volumes import random_volume
 
 from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.opencl import Device, download, upload
-from clrecon.operators.surface.marching_cubes import classify
+from clrecon.operators.surface.marching_cubes import Classifier
 from clrecon.operators.surface.slabs import SampleGrid, Slab
 
 
@@ -44,8 +44,29 @@ def test_inside_bits_and_extents_of_rows_equal_those_of_numpy(device_as_gpu, col
     slab = Slab(grid, first=0, end=3 + 2 * closed)
     level = np.dtype(dtype).type(grid.rule.lowest_inside)
 
-    made = classify(device_as_gpu, slab, upload(device_as_gpu, volume.voxels), [level])
+    made = Classifier(device_as_gpu, slab, [level]).mark_rest(upload(device_as_gpu, volume.voxels))
 
     mask, extents = inside_rows(volume.voxels >= level, grid.rule.border, grid.words)
     assert np.array_equal(download(device_as_gpu, np.empty_like(mask), made.mask_d), mask)
     assert np.array_equal(download(device_as_gpu, np.empty(extents.shape, np.uint16), made.row_extents_d), extents)
+
+
+@pytest.mark.parametrize("first", [0, 7])
+def test_rows_that_are_marked_as_their_voxels_land_equal_those_of_numpy(device, first):
+    """What has not landed is no bone; 17 of 18 MiB have."""
+    volume = random_volume((36 + first, 512, 512), dtype="int16", high=100)
+    grid = SampleGrid(volume, choose_iso_rule(volume, 60, closed=True))
+    slab = Slab(grid, first=first, end=grid.shape[2])
+    voxels = volume.voxels[slice(*slab.voxel_slices)]
+    landed_bytes = (17 << 20) + 99
+    landing = np.zeros_like(voxels)
+    landing.reshape(-1)[: landed_bytes // 2] = voxels.reshape(-1)[: landed_bytes // 2]
+
+    classifier = Classifier(device, slab, [np.int16(grid.rule.lowest_inside)])
+    classifier.mark_landed(upload(device, landing), landed_bytes)
+    made = classifier.mark_rest(upload(device, voxels))
+
+    mask, extents = inside_rows(volume.voxels >= grid.rule.lowest_inside, grid.rule.border, grid.words)
+    assert np.array_equal(download(device, np.empty_like(mask[first:]), made.mask_d), mask[first:])
+    found = download(device, np.empty(extents[first:].shape, np.uint16), made.row_extents_d)
+    assert np.array_equal(found, extents[first:])

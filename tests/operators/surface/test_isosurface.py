@@ -253,12 +253,13 @@ def test_surface_of_an_array_is_refused(device):
 def finds_no_surface(device, monkeypatch):
     """The device marks no voxel as inside."""
 
-    def find_nothing(device, slab, *_):
+    def find_nothing(classifier, *_):
+        slab = classifier.slab
         mask = np.zeros(slab.mask_rows * slab.grid.words, np.uint32)
         extents = np.zeros(2 * slab.mask_rows, np.uint16)
         return marching_cubes.Classified(*(marching_cubes.ocl.upload(device, array) for array in (mask, extents)))
 
-    monkeypatch.setattr(marching_cubes, "classify", find_nothing)
+    monkeypatch.setattr(marching_cubes.Classifier, "mark_rest", find_nothing)
 
 
 @pytest.mark.usefixtures("finds_no_surface")

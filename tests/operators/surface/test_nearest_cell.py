@@ -16,7 +16,7 @@ from clrecon.geometry.iso_rule import IsoRule, choose_iso_rule
 from clrecon.opencl import Stopwatch
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface.growing import find_cell_near
-from clrecon.operators.surface.marching_cubes import classify
+from clrecon.operators.surface.marching_cubes import Classifier
 from clrecon.operators.surface.seeds import SEED_REACH_MM
 from clrecon.operators.surface.slabs import SampleGrid, Slab
 from clrecon.proof.surface.growing import find_active
@@ -38,7 +38,7 @@ def make_finder(device: Any, volume: Volume, rule: IsoRule) -> Callable[[np.ndar
     grid, watch = SampleGrid(volume, rule), Stopwatch()
     with watch.running(device), DeviceVolume(volume, device=device) as resident:
         lowest_inside = (volume.voxels.dtype.type(rule.lowest_inside),)
-        marked = classify(device, Slab(grid, 0, grid.shape[2]), resident.whole(watch), lowest_inside)
+        marked = Classifier(device, Slab(grid, 0, grid.shape[2]), lowest_inside).mark_rest(resident.whole(watch))
 
     def find_cell(point: np.ndarray) -> np.ndarray:
         k, j, i = find_cell_near(device, grid, marked, point)
