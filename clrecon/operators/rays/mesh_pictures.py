@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from clrecon.operators.rays.point_pictures import eye_table
 from clrecon.rendering import Lighting
 from clrecon.rendering.pictures.object_looks import MeshLook
 from clrecon.rendering.views.camera import Camera
-from clrecon.system.light_dataclass import dataclass
+from clrecon.system.light_dataclass import dataclass, field
 from clrecon.system.pieces import find_bounds
 from clrecon.system.text import format_digits
 
@@ -38,9 +38,22 @@ MOST_PIECES = 1 << 28
 """Pieces of all large triangles of a mesh: half an hour a layer on two cores."""
 
 
-@dataclass(frozen=True, eq=False)
+_KEPT_SHARE = 8
+"""Of a device's memory an eighth at most is for the triangles of a part between two pictures."""
+
+
+class PartBuffers(NamedTuple):
+    """The arrays of a `MeshPart` on a device."""
+
+    vertices_d: Any
+    triangles_d: Any
+    normals_d: Any
+    colors_d: Any
+
+
+@dataclass(eq=False)
 class MeshPart:
-    """Triangles with one look, in the form for a device.
+    """Triangles with one look, in the form for a device, which keeps them for the next pictures.
 
     vertices: ndarray, shape (n, 3), float32. Mm from `base`, (3,) float64, LPS mm; finite.
     normals: ndarray, shape (n, 3), float32, or None. LPS, of any length; None: every triangle has its own.
@@ -58,6 +71,17 @@ class MeshPart:
     lighting: Lighting
     planes: Float64Array
     base: Float64Array
+    _sent: tuple[Any, PartBuffers] | None = field(default=None, init=False, repr=False)
+
+    def send(self, device: Device, stopwatch: Stopwatch) -> PartBuffers:
+        """Return the arrays on the device, sent now if they are not there."""
+        if self._sent is not None and self._sent[0] is device.context:
+            return self._sent[1]
+        normals, colors = _or_nothing(self.normals, np.float32), _or_nothing(self.colors, np.uint8)
+        with stopwatch.timed("upload"):
+            buffers = PartBuffers(*(upload(device, each) for each in (self.vertices, self.triangles, normals, colors)))
+        self._sent = (device.context, buffers) if self.device_bytes <= device.usable_bytes // _KEPT_SHARE else None
+        return buffers
 
     @property
     def device_bytes(self) -> int:
@@ -105,22 +129,19 @@ class Triangles:
         width, height = size
         with stopwatch.timed("upload"):
             self._view_d = upload(device, eye_table(camera, size, part.lighting, part.base))
-            self._triangles_d = upload(device, part.triangles)
             self._planes_d = upload(device, _camera_planes(camera, part.planes))
-            self._normals_d = upload(device, _or_nothing(part.normals, np.float32))
-            self._colors_d = upload(device, _or_nothing(part.colors, np.uint8))
             self._highlights_d = upload(device, highlight_table(part.lighting))
-            vertices_d = upload(device, part.vertices)
+        self._buffers = part.send(device, stopwatch)
         self._placed_d = allocate(device, 12 * len(part.vertices))
         self._picture: dict[str, Any] = {
-            "placed": self._placed_d, "triangles": self._triangles_d, "view": self._view_d, "width": width,
+            "placed": self._placed_d, "triangles": self._buffers.triangles_d, "view": self._view_d, "width": width,
             "height": height, "count": len(part.triangles),
         }  # fmt: skip
         sums_d = allocate(device, 4 * len(part.triangles))
         with stopwatch.running(device):  # wait: CPU devices read the host's arrays
             launch(
                 device, self._program["place_vertices"], len(part.vertices),
-                vertices=vertices_d, view=self._view_d, placed=self._placed_d, count=len(part.vertices),
+                vertices=self._buffers.vertices_d, view=self._view_d, placed=self._placed_d, count=len(part.vertices),
             )  # fmt: skip
             launch(device, self._program["count_pieces"], len(part.triangles), pieces=sums_d, **self._picture)
             scanned = exclusive_scan(device, sums_d, len(part.triangles), in_place=True)
@@ -152,9 +173,10 @@ class Triangles:
         color = np.array([*part.color, part.opacity], np.float32)
         launch(
             self.device, self._program["shade_triangles"], self._picture["width"] * self._picture["height"],
-            normals=self._normals_d, colors=self._colors_d, highlights=self._highlights_d, numbers=layer.numbers_d,
-            keys=layer.keys_d, layer=layer_d, layer_depths=depths_d, color=color, has_normals=part.normals is not None,
-            has_colors=part.colors is not None, shaded=part.lighting.shades, first=self.first, **self._picture,
+            normals=self._buffers.normals_d, colors=self._buffers.colors_d, highlights=self._highlights_d,
+            numbers=layer.numbers_d, keys=layer.keys_d, layer=layer_d, layer_depths=depths_d, color=color,
+            has_normals=part.normals is not None, has_colors=part.colors is not None, shaded=part.lighting.shades,
+            first=self.first, **self._picture,
         )  # fmt: skip
 
 

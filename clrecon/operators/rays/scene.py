@@ -22,13 +22,12 @@ from clrecon.mesh import Mesh
 from clrecon.opencl import Device, Stopwatch
 from clrecon.operators.masks.voxel_mask import zero_words
 from clrecon.operators.rays import mesh_pictures
-from clrecon.operators.rays.picture_buffers import Between, DrawnVolume, Shot
+from clrecon.operators.rays.picture_buffers import Between, DrawnVolume, LateDepths, PictureBuffers, Shot
 from clrecon.operators.rays.point_pictures import PointPictures, cloud_box, eye_table
 from clrecon.operators.rays.volume_renderer import VolumeRenderer, shown_box
 from clrecon.operators.resident.device_volume import DeviceVolume, DeviceWorker
 from clrecon.points import PointCloud
 from clrecon.rendering import Lighting, Rendering
-from clrecon.rendering.looks.colors import find_color
 from clrecon.rendering.pictures.object_looks import MeshLook, PointLook
 from clrecon.rendering.pictures.styles import SlicesInSpace, Style, SurfaceLook, VolumeLook
 from clrecon.rendering.views.camera import Camera, box_corners
@@ -51,13 +50,20 @@ class Still(NamedTuple):
 
 
 class LayeredPicture(NamedTuple):
-    """A picture of layers: (h, w, 4) uint8, depths (h, w) float32 mm, NaN: none; `open_pixels` may have more layers."""
+    """A picture of layers, (h, w, 4) uint8; `open_pixels` may have more layers."""
 
     image: NDArray[np.uint8]
-    depth: NDArray[np.float32]
-    expected_depth: NDArray[np.float32]
+    late_depths: LateDepths
     layers: int
     open_pixels: int
+
+    @property
+    def depth(self) -> NDArray[np.float32]:
+        return self.late_depths()[0]
+
+    @property
+    def expected_depth(self) -> NDArray[np.float32]:
+        return self.late_depths()[1]
 
 
 def draw_layers(
@@ -112,8 +118,7 @@ class _Layers:
         self.states_d, self.marks_d = ocl.allocate(device, 32 * self.pixels), ocl.allocate(device, 16 * self.pixels)
 
     def run(self, sample: Callable[[Between], None] | None, most: int) -> LayeredPicture:
-        device, (width, height) = self.device, self.size
-        background = self.shot.background
+        device = self.device
         with self.stopwatch.running(device):
             floors = {"floor_keys": self.keys.floor_keys_d, "floor_numbers": self.keys.floor_numbers_d}
             self._launch("clear_rays", pixels=self.pixels, **self._rays, **floors)
@@ -133,20 +138,12 @@ class _Layers:
         if sample is not None and (is_first or open_pixels):  # else all rays have gone to their ends already
             self._fill(self.depths_d, np.inf)
             self._sample(sample, is_first)
-        image, image_d = ocl.empty_output(device, (height, width, 4), np.uint8)
-        depths, first_d = ocl.empty_output(device, (height, width), np.float32)
-        means, means_d = ocl.empty_output(device, (height, width), np.float32)
-        ground = np.zeros(4, np.float32)
-        if background is not None:
-            ground[:] = *find_color(background), 1.0
+        output = PictureBuffers(device, self.size, self.shot.background, several_slabs=False)
+        arguments = {**output.arguments, **self._rays, **self._place}
         with self.stopwatch.running(device):
-            self._launch(
-                "finish_rays", image=image_d, depths=first_d, means=means_d, background=ground, near_mm=self.near_mm,
-                **self._rays, **self._place,
-            )  # fmt: skip
+            self._launch("finish_rays", near_mm=self.near_mm, **arguments)
         with self.stopwatch.timed("download"):
-            ocl.download_all(device, (image, image_d, 0), (depths, first_d, 0), (means, means_d, 0))
-        return LayeredPicture(image, depths, means, drawn, open_pixels)
+            return LayeredPicture(*output.download_image(), drawn, open_pixels)
 
     def _draw_layer(self) -> None:
         """Find the nearest of each pixel behind the floor, with its colour and depth."""
@@ -358,7 +355,7 @@ class ScenePictures(DeviceWorker):
             "kernel_seconds": dict(stopwatch.by_kernel),
             "warnings": warnings,
         }
-        return Rendering(layers.image, layers.depth, layers.expected_depth, shot.camera, None, modes[0], report)
+        return Rendering.with_late_depths(layers.late_depths, layers.image, shot.camera, None, modes[0], report)
 
 
 def _box_of(objects: Sequence[tuple[Subject, Style]]) -> Grid:

@@ -16,7 +16,7 @@ import clrecon
 from clrecon import Mesh, MeshLook
 from clrecon.errors import DeviceError, UsageError
 from clrecon.opencl import Stopwatch
-from clrecon.operators.rays import mesh_pictures, scene
+from clrecon.operators.rays import mesh_pictures, picture_buffers, scene
 from clrecon.operators.rays.mesh_pictures import make_part
 from clrecon.operators.rays.picture_buffers import DrawnVolume, Shot
 from clrecon.operators.rays.scene import LAYERS, PIXEL_BYTES, Still, draw_layers
@@ -353,7 +353,8 @@ def test_bytes_a_pixel_are_those_of_the_buffers(device: Any, monkeypatch: pytest
 
         return call
 
-    for module, names in ((scene.ocl, ("allocate", "upload", "empty_output")), (mesh_pictures, ("allocate",))):
+    names_of = {scene.ocl: ("allocate", "upload"), mesh_pictures: ("allocate",), picture_buffers: ("empty_output",)}
+    for module, names in names_of.items():
         for name in names:
             monkeypatch.setattr(module, name, counted(getattr(module, name), name))
 
