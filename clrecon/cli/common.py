@@ -214,7 +214,6 @@ def _join_negative_lists(arguments: Sequence[str]) -> list[str]:
 
 
 def add_common(parser: argparse.ArgumentParser) -> None:
-    """Add --help-all, --json, -q, -v and --debug."""
     parser._option_string_actions["--help"].help = "show the options that most people need, on one screen, and exit"
     parser.add_argument("--help-all", action=_FullHelp, nargs=0, help="show all options, by group, and exit")
     streams = [option for option in ("-o", "--report") if option in parser._option_string_actions]
@@ -278,7 +277,6 @@ def add_picture(container: argparse._ActionsContainer, text: str, metavar: str =
 
 
 def add_report(container: argparse._ActionsContainer, content: str, *, first: bool = True) -> None:
-    """Add --report, which writes `content` as JSON."""
     container.add_argument("--report", metavar="FILE", help=f"write {content} as JSON", first=first)
 
 

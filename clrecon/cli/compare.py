@@ -75,7 +75,6 @@ def _is_missed(method: dict[str, Any], asked: Sequence[str]) -> bool:
 
 
 def _describe_comparison(report: dict[str, Any]) -> list[str]:
-    """Describe a comparison for people: the input, the table in short, what the numbers say."""
     rows = [("method", "triangles", "first s", "warm s", "memory MB", "slices Dice", "HD95 mm", "scatter mm")]
     for method in report["methods"]:
         if method["state"] != "done":

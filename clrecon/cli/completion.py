@@ -56,7 +56,6 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
 
 def write_script(shell: str) -> str:
-    """Return the script of a shell, made from the parsers of all commands."""
     if shell not in SHELLS:
         raise UsageError(f"no completion for {shell!r:.60}{guess_word(shell, SHELLS)}: use one of {', '.join(SHELLS)}")
     from clrecon.cli.main import COMMANDS, HELP

@@ -216,11 +216,9 @@ class Console:
             self._to_stderr(f"clrecon: warning: {printable(text)}")
 
     def error(self, text: str) -> None:
-        """Print the last line of a command that failed."""
         self._to_stderr(f"clrecon: error: {printable(text)}")
 
     def progress(self, stage: str, done: int = 0, total: int = 0) -> None:
-        """Show the progress of a job, see `clrecon.system.progress`."""
         if self.verbose and stage != self._stage:
             elapsed = time.perf_counter() - self._start
             self._to_stderr(f"clrecon: {elapsed:6.2f} s  {_STAGES.get(stage, stage)}")

@@ -144,7 +144,6 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
 
 def describe_mesh(report: dict[str, Any]) -> list[str]:
-    """Describe a report for people: the input, the meshes, the device, the time."""
     border = "closed" if report["closed_at_border"] else "open"
     end = "crop" if report["volume"].get("crop") else "volume"
     return [
@@ -172,7 +171,6 @@ def _describe_surfaces(report: dict[str, Any]) -> str:
 
 
 def _describe_solid(solid: dict[str, Any] | None) -> list[str]:
-    """Describe what was filled in a line; no line where nothing should be."""
     if solid is None:
         return []
     left = sum(kind["ml"] for kind in solid["open"].values())
@@ -190,14 +188,12 @@ def _describe_inside(low: float | None, high: float | None) -> str:
 
 
 def _describe_slabs(report: dict[str, Any]) -> str:
-    """Give the number of slabs, if the volume did not fit as a whole."""
     if report["slabs"] == 1:
         return ""
     return f", {report['slabs']} slabs of at most {common.megabytes(sum(report['device_bytes'].values()))}"
 
 
 def _describe_choice(report: dict[str, Any]) -> str:
-    """Give the reason for the iso value in a few words."""
     choice = report["iso_value_choice"]
     if choice is None:
         if report["preset"] == "bone":
@@ -220,7 +216,6 @@ def _describe_costs(volume: dict[str, Any]) -> str:
 
 
 def _describe_parts(meshes: list[dict[str, Any]]) -> list[str]:
-    """Describe each of several meshes in a line; of many meshes only some."""
     if len(meshes) == 1:
         return []
     lines = []
@@ -270,7 +265,6 @@ def describe_cortex(meshes: list[dict[str, Any]]) -> list[str]:
 
 
 def describe_labels(meshes: list[dict[str, Any]]) -> list[str]:
-    """Describe the surfaces of labels in a line; no line without labels."""
     labels = [mesh for mesh in meshes if mesh["label"] is not None]
     if not labels:
         return []
@@ -352,7 +346,6 @@ def _describe_smoothing(smoothing: dict[str, Any]) -> str:
 
 
 def _describe_decimation(decimation: dict[str, Any]) -> str:
-    """Describe how many triangles were removed, how many were asked for, and why decimation ended."""
     asked, reached = 100 * decimation["fraction"], 100 * decimation["reached"]
     topology = _describe_topology(decimation["topology"])
     if decimation["ended_by"] == "share":
@@ -362,7 +355,6 @@ def _describe_decimation(decimation: dict[str, Any]) -> str:
 
 
 def _describe_topology(topology: Mapping[str, Any]) -> str:
-    """Describe the Euler number before and after, and in how many components it changed."""
     before, after = topology["euler_number_before"], topology["euler_number_after"]
     if not (topology["components_changed"] or topology["components_lost"]):
         return f"Euler number {before} before and after"

@@ -88,7 +88,6 @@ def _lay_out(report: dict[str, Any], width: int | None) -> list[str]:
 
 
 def _lay_out_surfaces(labels: Sequence[dict[str, Any]]) -> list[str]:
-    """Lay out the figures of the labels' surfaces as a table; no line without any."""
     from clrecon.jobs.stats import surface_cells
 
     of = [one["surface"] for one in labels if one["surface"]]

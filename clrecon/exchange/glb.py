@@ -157,7 +157,6 @@ def _binary_length(content: Content | Assembly) -> int:
 
 
 def estimate(content: Content | Assembly) -> int:
-    """Return the exact size of the file in bytes."""
     return 12 + 8 + len(_json_chunk(content)) + 8 + _binary_length(content)
 
 
@@ -178,7 +177,6 @@ def write(stream: BinaryIO, content: Content | Assembly) -> None:
 
 
 def verify(path: Path, content: Content | Assembly) -> None:
-    """Check lengths, matrix and counts of a finished file."""
     size = path.stat().st_size
     check_same("bytes", size, estimate(content))
     with path.open("rb") as stream:

@@ -83,7 +83,6 @@ def write(stream: BinaryIO, content: PointContent) -> None:
 
 
 def verify(path: Path, content: PointContent) -> None:
-    """Check size and count of a finished file."""
     with path.open("rb") as stream:
         head = stream.read(_HEAD_BYTES)
     length = _POINT_BYTES + 4 * len(_extra(content))

@@ -72,7 +72,6 @@ def write(stream: BinaryIO, content: PointContent) -> None:
 
 
 def verify(path: Path, content: PointContent) -> None:
-    """Check the names, sums and headers of the entries of a finished file."""
     expected = _arrays(content)
     try:
         with zipfile.ZipFile(path) as archive:

@@ -83,7 +83,6 @@ def _write_part(stream: BinaryIO, part: Content, before: int, normals_before: in
 
 
 def verify(path: Path, content: Content | Assembly) -> None:
-    """Check the header and count the lines of a finished file."""
     parts = parts_of(content)
     expected = {
         "vertices": (b"\nv ", sum(len(part.vertices) for part in parts)),

@@ -42,7 +42,7 @@ from clrecon.version import package_version
 STEPS = 65_535
 """Steps of a coordinate along a side of the bounding box; of a number at a vertex this one means that none is known."""
 
-_NORMAL_SCALE = 127.0
+NORMAL_SCALE = 127.0
 _LEVEL = 4
 """Of zlib: 6 takes twice as long, for files 2.5 % smaller."""
 
@@ -86,7 +86,7 @@ def encode_surface(
     def pack_vertices() -> bytes:
         scaled = (places - low) / np.where(step > 0.0, step, 1.0)
         positions = np.clip(np.rint(scaled), 0, STEPS).astype(np.uint16)
-        turned = np.rint(_NORMAL_SCALE * np.clip(normals[order], -1.0, 1.0)).astype(np.int8)
+        turned = np.rint(NORMAL_SCALE * np.clip(normals[order], -1.0, 1.0)).astype(np.int8)
         folded = _fold(positions, np.uint16, np.int16), _fold(turned.view(np.uint8), np.uint8, np.int8)
         return b"".join(packer.compress(_split_planes(values)) for values in folded)
 
@@ -102,34 +102,7 @@ def encode_surface(
     return CodedSurface(len(order), len(triangles), corner, sides, data + packer.flush(), numbers.shape[1])
 
 
-def decode_surface(coded: CodedSurface) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.uint32]]:
-    """Return vertices in mm, normals (not of unit length: as they were rounded) and triangles, as a page shows them."""
-    data = _unpack_planes(coded)
-    n = coded.vertices
-    positions = _unfold(_join_planes(data[: 6 * n], 3, np.uint16), np.uint16)
-    turned = _unfold(_join_planes(data[6 * n : 9 * n], 3, np.uint8), np.uint8).view(np.int8)
-    codes = _join_planes(data[9 * n : 9 * n + 12 * coded.triangles], 1, np.uint32)[:, 0].astype(np.int64)
-    # A code of 0 is a vertex that was not there before: the highest so far is the number of these, less one.
-    new = np.cumsum(codes == 0)
-    indices = np.concatenate(([0], new[:-1])) - codes
-    if len(indices) and (indices.min() < 0 or indices.max() >= n):
-        raise ValueError("the surface has indices without a vertex")
-    vertices = np.array(coded.low_mm) + positions.astype(np.float64) * np.array(coded.step_mm)
-    normals = (turned / np.float32(_NORMAL_SCALE)).astype(np.float32)
-    return vertices, normals, indices.reshape(-1, 3).astype(np.uint32)
-
-
-def decode_values(facts: dict[str, Any], coded: CodedSurface) -> dict[str, NDArray[np.float64]]:
-    """Return the numbers in mm at the vertices of a page by name, NaN where none is known."""
-    planes = _unpack_planes(coded)[9 * coded.vertices + 12 * coded.triangles :]
-    codes = _unfold(_join_planes(planes, coded.columns, np.uint16), np.uint16).T
-    return {
-        column["name"]: np.where(own == STEPS, np.nan, column["low"] + column["step"] * own)
-        for column, own in zip(facts.get("values", ()), codes, strict=True)
-    }
-
-
-def _unpack_planes(coded: CodedSurface) -> NDArray[np.uint8]:
+def unpack_planes(coded: CodedSurface) -> NDArray[np.uint8]:
     deflate = find_deflate()
     try:
         data = np.frombuffer(deflate.decompress(coded.data, GZIP), np.uint8)
@@ -160,21 +133,11 @@ def _fold(values: NDArray[Any], unsigned: type[np.integer[Any]], signed: type[np
     return ((changes << 1) ^ (changes >> (8 * changes.itemsize - 1))).view(unsigned)
 
 
-def _unfold(folded: NDArray[Any], unsigned: type[np.integer[Any]]) -> NDArray[Any]:
-    """Return the rows whose differences `_fold` gave."""
-    return np.cumsum((folded >> 1) ^ -(folded & 1), axis=0, dtype=unsigned)
-
-
 def _split_planes(values: NDArray[Any]) -> bytes:
     """Return the bytes of unsigned numbers (n, k) as planes: the lowest byte of each column in turn, then the next."""
     size = values.dtype.itemsize
     little = values.astype(f"<u{size}", copy=False)
     return little.view(np.uint8).reshape(*values.shape, size).transpose(2, 1, 0).tobytes()
-
-
-def _join_planes(planes: NDArray[np.uint8], columns: int, kind: type[np.unsignedinteger[Any]]) -> NDArray[Any]:
-    stacked = planes.reshape(np.dtype(kind).itemsize, columns, -1)
-    return sum((plane.astype(kind) << kind(8 * byte) for byte, plane in enumerate(stacked)), np.zeros((), kind)).T
 
 
 MOST_TRIANGLES = 10_000_000
@@ -183,7 +146,7 @@ MOST_TRIANGLES = 10_000_000
 _LEAST_BYTES_A_TRIANGLE = 0.5
 """Of the surface: a regular one packs to 0.7, those of scans to 5 to 8."""
 
-_BLOCK = re.compile(r'<script id="(facts|surface|slices)" type="[a-z/]+">([^<]*)</script>')
+BLOCK = re.compile(r'<script id="(facts|surface|slices)" type="[a-z/]+">([^<]*)</script>')
 
 
 def estimate(content: Content | Assembly) -> int:
@@ -240,7 +203,7 @@ def compose_page(content: Content | Assembly) -> bytes:
 
 def parse_page(page: bytes) -> tuple[dict[str, Any], CodedSurface]:
     """Return the facts and the surface that a page of `compose_page` holds."""
-    blocks = dict(_BLOCK.findall(page.decode("utf-8")))
+    blocks = dict(BLOCK.findall(page.decode("utf-8")))
     if set(blocks) - {"slices"} != {"facts", "surface"} or not page.endswith(b"</html>\n"):
         raise ValueError("this is no page of a surface")
     facts = json.loads(blocks["facts"])
@@ -248,14 +211,6 @@ def parse_page(page: bytes) -> tuple[dict[str, Any], CodedSurface]:
     corner, sides = tuple(facts["low"]), tuple(facts["step"])
     columns = len(facts.get("values", ()))
     return facts, CodedSurface(facts["vertices"], facts["triangles"], corner, sides, data, columns)
-
-
-def parse_slices(page: bytes) -> PackedSlices | None:
-    """Return the slices that a page of `compose_page` holds, if it has some."""
-    blocks = dict(_BLOCK.findall(page.decode("utf-8")))
-    if "slices" not in blocks:
-        return None
-    return PackedSlices(json.loads(blocks["facts"])["slices"], base64.b64decode(blocks["slices"], validate=True))
 
 
 def read_facts(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -267,7 +222,7 @@ def verify(path: Path, content: Content | Assembly) -> None:
     """Unpack a finished file, whose gzip has a checksum, and count what is in it."""
     try:
         _, coded = parse_page(path.read_bytes())
-        _unpack_planes(coded)
+        unpack_planes(coded)
     except ValueError as error:
         raise refuse_file(f"({error})", "no page", "a page") from error
     check_same("triangles", coded.triangles, sum(len(part.triangles) for part in parts_of(content)))

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.affine import Float64Array
 from clrecon.system.arguments import name_parameter
 from clrecon.system.light_dataclass import dataclass
 
@@ -76,17 +75,7 @@ def pack_slices(volume: Volume, windows: Mapping[str, Sequence[float]], most_byt
     return PackedSlices(facts, data)
 
 
-def unpack_slices(facts: dict[str, Any], data: bytes) -> Float64Array:
-    """Return the HU (nk, nj, ni) of packed slices, as a page shows them."""
-    ni, nj, nk = facts["shape"]
-    planes = np.frombuffer(zlib.decompress(data, wbits=16 + zlib.MAX_WBITS), np.uint8).reshape(2, nk, nj, ni)
-    folded = planes[0].astype(np.int32) | (planes[1].astype(np.int32) << 8)
-    values = np.cumsum((folded >> 1) ^ -(folded & 1), axis=2)
-    return np.asarray(facts["low_hu"] + facts["step_hu"] * values, dtype=np.float64)
-
-
 def describe_slices(facts: dict[str, Any]) -> str:
-    """Return a line about slices for the page."""
     size = " x ".join(str(count) for count in facts["shape"])
     averaged = facts["averaged"]
     means = "" if max(averaged) == 1 else f", each the mean of {' x '.join(map(str, averaged))} voxels"

@@ -92,14 +92,12 @@ def _face(content: Content) -> np.dtype[Any]:
 
 
 def estimate(content: PointContent) -> int:
-    """Return the exact size of the file in bytes."""
     rows = _vertex(content).itemsize * len(content.vertices)
     faces = _face(content).itemsize * len(content.triangles) if isinstance(content, Content) else 0
     return len(_header(content)) + rows + faces
 
 
 def write(stream: BinaryIO, content: PointContent) -> None:
-    """Write vertices, with what is known of each, and the faces of a mesh."""
     _write_head(stream, content)
     _write_vertices(stream, content)
     if isinstance(content, Content):
@@ -148,7 +146,6 @@ def _write_rows(stream: BinaryIO, rows: NDArray[Any], columns: Mapping[str, NDAr
 
 
 def verify(path: Path, content: PointContent) -> None:
-    """Check header (with its counts) and size of a finished file."""
     expected = _header(content)
     with path.open("rb") as stream:
         check_same("in the header", stream.read(len(expected)), expected)

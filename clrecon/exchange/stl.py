@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import re
 import struct
-from collections import deque
 from collections.abc import Iterable
-from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
@@ -27,6 +27,7 @@ from clrecon.exchange.content import Content, check_same, refuse_file
 from clrecon.exchange.coordinates import find_places, rounded_apart
 from clrecon.exchange.raw_content import MARK, RawMesh, plain_lines, say_cut
 from clrecon.system.paths import open_regular
+from clrecon.system.pieces import chunks, deal_in_order
 from clrecon.system.text import escape_text
 
 _HEAD = 84
@@ -34,8 +35,6 @@ _FACET_BYTES = 50
 """Bytes of a facet: normal, three corners and two unused bytes."""
 _CHUNK = 1 << 14
 """Facets in a piece, so that its data stay in the processor's cache."""
-_AHEAD = 4
-"""Number of pieces that may be packed before they are written, which bounds the memory."""
 
 
 def _header(content: Content) -> bytes:
@@ -43,7 +42,6 @@ def _header(content: Content) -> bytes:
 
 
 def estimate(content: Content) -> int:
-    """Return the exact size of the file in bytes."""
     return _HEAD + _FACET_BYTES * len(content.triangles)
 
 
@@ -71,14 +69,9 @@ def _write_head(stream: BinaryIO, content: Content) -> None:
 
 def _write_facets(stream: BinaryIO, vertices: NDArray[np.float32], triangles: NDArray[np.uint32]) -> None:
     coordinates = [np.ascontiguousarray(vertices[:, axis]) for axis in range(3)]
-    with ThreadPoolExecutor(max_workers=2) as pool:  # numpy releases the interpreter's lock here
-        waiting: deque[Future[bytearray]] = deque()
-        for start in range(0, len(triangles), _CHUNK):
-            waiting.append(pool.submit(_pack_facets, coordinates, triangles[start : start + _CHUNK]))
-            if len(waiting) > _AHEAD:
-                stream.write(waiting.popleft().result())
-        while waiting:
-            stream.write(waiting.popleft().result())
+    packers = [partial(_pack_facets, coordinates)] * 2  # numpy releases the interpreter's lock
+    with closing(deal_in_order(packers, (triangles[piece] for piece in chunks(len(triangles), _CHUNK)))) as packed:
+        stream.writelines(packed)
 
 
 def _pack_facets(coordinates: list[NDArray[np.float32]], triangles: NDArray[np.uint32]) -> bytearray:
@@ -99,7 +92,6 @@ def _pack_facets(coordinates: list[NDArray[np.float32]], triangles: NDArray[np.u
 
 
 def verify(path: Path, content: Content) -> None:
-    """Check header, count and size of a finished file."""
     with path.open("rb") as stream:
         head = stream.read(_HEAD)
     if head[:80] != _header(content) or len(head) != _HEAD:

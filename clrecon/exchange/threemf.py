@@ -133,7 +133,6 @@ def _description(content: Content) -> str:
 
 
 def verify(path: Path, content: Content | Assembly) -> None:
-    """Unpack the finished file, which verifies its checksums, and count its elements."""
     vertices = triangles = 0
     tail = b""
     deflate = find_deflate()

@@ -42,7 +42,6 @@ class Document:
 
 
 def parse_document(data: bytes, name: str) -> Document:
-    """Return the parts of a file of PolyData."""
     head, mark, tail = data.partition(b"<AppendedData")
     if b"<!DOCTYPE" in head or b"<!ENTITY" in head:
         raise ValueError("it declares a document type, which VTP has not")

@@ -23,17 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError, UsageError
+from clrecon.exchange import vtk_xml
 from clrecon.exchange.content import BONE_COLOR, Assembly, Content, PointContent, refuse_file
 from clrecon.exchange.raw_content import Part, PlacedShapes, RawCloud, RawMesh, Shape, columns_of, numbers_of, say_cut
-from clrecon.exchange.vtk_xml import (
-    LONGEST_TEXT,
-    Document,
-    parse_document,
-    read_arrays,
-    read_count,
-    read_fields,
-    read_numbers,
-)
+from clrecon.exchange.vtk_xml import Document
 from clrecon.system.light_dataclass import replace
 from clrecon.system.paths import open_regular
 from clrecon.system.text import escape_text
@@ -260,7 +253,6 @@ def _facts(content: PointContent, parts: Sequence[Content]) -> dict[str, Any]:
 
 
 def verify(path: Path, content: PointContent | Assembly) -> None:
-    """Check the counts in the XML and the end of a finished file."""
     least, content = estimate(content), _join_meshes(content)
     with path.open("rb") as stream:
         head = stream.read(8192).decode("latin-1")
@@ -295,7 +287,7 @@ def _read_document(path: Path, collect: Callable[[Document, str], Raw]) -> Raw:
     name = escape_text(path.name)
     try:
         with open_regular(path) as stream:
-            document = parse_document(stream.read(), name)
+            document = vtk_xml.parse_document(stream.read(), name)
         return collect(document, name)
     except (OSError, ValueError, LookupError, OverflowError, MemoryError, ElementTree.ParseError, zlib.error) as error:
         raise say_cut(name, error) from error
@@ -304,7 +296,7 @@ def _read_document(path: Path, collect: Callable[[Document, str], Raw]) -> Raw:
 def has_polygons(path: Path) -> bool:
     """True for a file whose XML counts polygons; its arrays are not looked at."""
     with open_regular(path) as stream:
-        start = stream.read(LONGEST_TEXT)
+        start = stream.read(vtk_xml.LONGEST_TEXT)
     return any(int(count) for count in re.findall(rb'NumberOfPolys="(\d{1,15})"', start))
 
 
@@ -313,19 +305,19 @@ def _collect_points(document: Document, name: str) -> RawCloud:
     lines = faces = 0
     normals = None
     for piece in document.root.iterfind("PolyData/Piece"):
-        count = read_count(piece, "NumberOfPoints")
+        count = vtk_xml.read_count(piece, "NumberOfPoints")
         array = piece.find("Points/DataArray")
         if count == 0 or array is None:
             continue
-        points.append(read_numbers(document, array, count, 3))
+        points.append(vtk_xml.read_numbers(document, array, count, 3))
         data = piece.find("PointData")
         normals = normals or (None if data is None else data.get("Normals"))
-        columns.append(read_arrays(document, piece, "PointData", count))
-        faces += sum(read_count(piece, f"NumberOf{kind}") for kind in ("Strips", "Polys"))
-        lines += read_count(piece, "NumberOfLines")
+        columns.append(vtk_xml.read_arrays(document, piece, "PointData", count))
+        faces += sum(vtk_xml.read_count(piece, f"NumberOf{kind}") for kind in ("Strips", "Polys"))
+        lines += vtk_xml.read_count(piece, "NumberOfLines")
     if not points:
         raise RefusedInputError(f"{name} has no points")
-    texts, numbers = read_fields(document)
+    texts, numbers = vtk_xml.read_fields(document)
     affine, iso_value = numbers.get("AFFINE_IJK_TO_LPS_MM"), numbers.get("ISO_VALUE_HU")
     return RawCloud(
         "VTP",
@@ -360,23 +352,23 @@ def _collect_triangles(document: Document, name: str) -> RawMesh:
     points: list[dict[str, NDArray[Any]]] = []
     cells: list[dict[str, NDArray[Any]]] = []
     for piece in document.root.iterfind("PolyData/Piece"):
-        if read_count(piece, "NumberOfStrips"):
+        if vtk_xml.read_count(piece, "NumberOfStrips"):
             raise RefusedInputError(f"{name} has triangle strips: only single triangles are read")
-        count = read_count(piece, "NumberOfPolys")
-        lines = {kind: read_count(piece, f"NumberOf{kind}") for kind in ("Verts", "Lines")}
+        count = vtk_xml.read_count(piece, "NumberOfPolys")
+        lines = {kind: vtk_xml.read_count(piece, f"NumberOf{kind}") for kind in ("Verts", "Lines")}
         left_out += sum(lines.values())
         if count == 0:
             continue
-        points.append(read_arrays(document, piece, "PointData", read_count(piece, "NumberOfPoints")))
+        points.append(vtk_xml.read_arrays(document, piece, "PointData", vtk_xml.read_count(piece, "NumberOfPoints")))
         shape = _read_shape(document, piece, count, name, warnings, points[-1])
         shapes.add(shape, np.eye(4), Part("", count))
-        cells.append({} if any(lines.values()) else read_arrays(document, piece, "CellData", count))
+        cells.append({} if any(lines.values()) else vtk_xml.read_arrays(document, piece, "CellData", count))
     if left_out:
         warnings.append(f"elements left out: {left_out:,} points and lines")
     if not cells:
         raise RefusedInputError(f"{name} has no triangles: it is no mesh, perhaps a cloud of points")
     mesh = shapes.joined()
-    texts, numbers = read_fields(document)
+    texts, numbers = vtk_xml.read_fields(document)
     iso_value = numbers.get("ISO_VALUE_HU")
     at_cells, at_points = _common(cells), _common(points)
     colors = at_cells.pop("COLOR", None)
@@ -418,14 +410,14 @@ def _read_shape(
     arrays = {array.get("Name"): array for array in piece.iterfind("Polys/DataArray")}
     if points is None or not {"connectivity", "offsets"} <= set(arrays):
         raise ValueError("a piece without points or polygons")
-    vertices = read_numbers(document, points, read_count(piece, "NumberOfPoints"), 3)
-    ends = read_numbers(document, arrays["offsets"], count, 1).ravel().astype(np.int64)
+    vertices = vtk_xml.read_numbers(document, points, vtk_xml.read_count(piece, "NumberOfPoints"), 3)
+    ends = vtk_xml.read_numbers(document, arrays["offsets"], count, 1).ravel().astype(np.int64)
     wrong = np.flatnonzero(np.diff(ends, prepend=0) != 3)
     if len(wrong):
         first = int(wrong[0])
         corners = int(ends[first] - (ends[first - 1] if first else 0))
         raise RefusedInputError(f"polygon {first:,} of {name} has {corners} corners: only triangles are read")
-    triangles = read_numbers(document, arrays["connectivity"], 3 * count, 1).astype(np.int64).reshape(-1, 3)
+    triangles = vtk_xml.read_numbers(document, arrays["connectivity"], 3 * count, 1).astype(np.int64).reshape(-1, 3)
     data = piece.find("PointData")
     values = at_points.get("Normals" if data is None else data.get("Normals", "Normals"))
     if values is None or values.shape[1] != 3:

@@ -55,7 +55,6 @@ def write(stream: BinaryIO, content: PointContent) -> None:
 
 
 def verify(path: Path, content: PointContent) -> None:
-    """Check the head and count the lines of a finished file."""
     header = _header(content)
     with path.open("rb") as stream:
         check_same("in the header", stream.read(len(header)), header)

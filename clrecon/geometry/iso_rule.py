@@ -11,15 +11,9 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.geometry import vertices
 from clrecon.geometry.affine import normal_matrix
 from clrecon.geometry.grid import AIR_HU
-from clrecon.geometry.vertices import (
-    check_vertex_rule,
-    find_vertex_origin,
-    float32_step,
-    largest_coordinate,
-    power_of_two_over,
-)
 from clrecon.geometry.volume import Volume
 from clrecon.system.arguments import Topology
 from clrecon.system.light_dataclass import dataclass, replace
@@ -188,7 +182,7 @@ def choose_iso_rule(
     """
     iso_value, upper_value, below = _checked_level(iso_value, below, volume.voxels.dtype)
     check_topology(topology, ranged=upper_value is not None)
-    check_vertex_rule(vertex_rule, topology)
+    vertices.check_vertex_rule(vertex_rule, topology)
     dtype = volume.voxels.dtype
     value_scale = 1.0
     values = values or ValueRange(volume)
@@ -198,7 +192,7 @@ def choose_iso_rule(
             raise NoSurfaceError(f"the voxels run from {low} to {high}: infinite values have no iso surface")
         if max(-low, high) > LARGEST_FLOAT:
             raise UsageError(f"the voxels run from {low:g} to {high:g}: beyond {LARGEST_FLOAT:g} is not supported")
-        value_scale = power_of_two_over(max(-low, high, abs(iso_value), abs(upper_value or 0.0)))
+        value_scale = vertices.power_of_two_over(max(-low, high, abs(iso_value), abs(upper_value or 0.0)))
         iso_level = float(np.float32(iso_value))
         lowest_inside: int | float = iso_level
     else:
@@ -333,8 +327,8 @@ def layer_margins(volume: Volume, border: int) -> NDArray[np.float64]:
 
 def _largest_and_unit(volume: Volume, border: int) -> tuple[float, float]:
     """Return the largest coordinate of a vertex, mm from the vertex origin, and the float32 step at that coordinate."""
-    largest = largest_coordinate(volume, find_vertex_origin(volume), border)
-    return largest, float32_step(largest)
+    largest = vertices.largest_coordinate(volume, vertices.find_vertex_origin(volume), border)
+    return largest, vertices.float32_step(largest)
 
 
 def slice_normal_matrices(volume: Volume, border: int) -> NDArray[np.float64]:

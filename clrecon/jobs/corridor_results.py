@@ -35,8 +35,6 @@ KNOWN_CORTEX_BIAS = (
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CorridorReport(ScanReport):
-    """The report of the corridor job; docs/contract.md explains its entries."""
-
     SCHEMA = "corridor"
 
     notice: str

@@ -42,8 +42,6 @@ _LEAST_RANGE_MM = 1e-3
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DistanceReport(JobReport):
-    """Report of `measure_meshes`; docs/contract.md explains its entries."""
-
     SCHEMA = "distance"
 
     a: Mapping[str, Any]

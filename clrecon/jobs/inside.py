@@ -76,8 +76,6 @@ log = get_logger(__name__)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class InsideReport(RunReport):
-    """The report of the job; docs/contract.md explains its entries."""
-
     SCHEMA = "inside"
 
     vertebrae: list[dict[str, Any]]

@@ -30,8 +30,6 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class VertebraeReport(ScanReport):
-    """Report of `make_vertebrae`; docs/contract.md explains its entries."""
-
     SCHEMA = "vertebrae"
 
     _LEFT_OUT = ("stored",)

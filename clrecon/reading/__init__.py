@@ -199,6 +199,6 @@ def tell_format(path: str | os.PathLike[str]) -> str | None:
     if kind is None and is_named:
         pair = "; of a NIfTI pair give the .hdr" if name.endswith((".img", ".img.gz")) else ""
         raise RefusedInputError(
-            f"{escape_text(file.name)} is no NIfTI, NRRD, MetaImage or OME-Zarr file, whatever its name says{pair}"
+            f"{escape_text(file.name)} is no NIfTI, NRRD, MetaImage or OME-Zarr file, despite its name{pair}"
         )
     return None

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
 from contextvars import copy_context
 from queue import SimpleQueue
 from typing import Any, TypeVar
@@ -39,22 +40,11 @@ def in_threads(
     done: Called in the caller's thread with each finished slice, in order.  What either raises is raised here.
     """
     pieces = list(chunks(count, size))
-    threads = count_readers(len(pieces), _MOST_THREADS)
-    if threads == 1 or len(pieces) < _FEWEST_PIECES:
-        for piece in pieces:
-            work(piece)
+    threads = 1 if len(pieces) < _FEWEST_PIECES else count_readers(len(pieces), _MOST_THREADS)
+    with closing(deal_in_order([work] * threads, pieces)) as finished:
+        for piece, _ in zip(pieces, finished, strict=True):
             if done is not None:
                 done(piece)
-        return
-    with ThreadPoolExecutor(threads) as pool:
-        finished = pool.map(work, pieces)
-        try:
-            for piece, _ in zip(pieces, finished, strict=True):
-                if done is not None:
-                    done(piece)
-        except BaseException:
-            pool.shutdown(wait=True, cancel_futures=True)
-            raise
 
 
 _One = TypeVar("_One")

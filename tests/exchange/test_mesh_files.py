@@ -14,13 +14,14 @@ import numpy as np
 import pytest
 import sample_meshes as samples
 import tolerances
+from coded_pages import decode_surface
 from full_disk import FullDisk
 from refusals import refused
 
 from clrecon.errors import NoSurfaceError, OutputError, UsageError
 from clrecon.exchange import formats as writers
 from clrecon.exchange.formats import FORMATS
-from clrecon.exchange.page import decode_surface, parse_page
+from clrecon.exchange.page import parse_page
 from clrecon.mesh import Mesh
 
 pytestmark = pytest.mark.unit

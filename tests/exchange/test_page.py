@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 import sample_meshes as samples
 import tolerances
+from coded_pages import decode_surface, decode_values
 from refusals import refused
 
 from clrecon.errors import UsageError
 from clrecon.exchange import page as pages
 from clrecon.exchange.formats import MOST_PARTS, stage_assembly
-from clrecon.exchange.page import STEPS, decode_surface, decode_values, encode_surface
+from clrecon.exchange.page import STEPS, encode_surface
 from clrecon.mesh import Mesh
 
 pytestmark = pytest.mark.unit

@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import view_scenes as scenes
+from coded_pages import parse_slices, unpack_slices
 from refusals import refused
 from sample_meshes import ball
 
 from clrecon.errors import UsageError
-from clrecon.exchange.page import parse_page, parse_slices
-from clrecon.exchange.page_slices import MOST_BYTES, pack_slices, unpack_slices
+from clrecon.exchange.page import parse_page
+from clrecon.exchange.page_slices import MOST_BYTES, pack_slices
 from clrecon.geometry import Volume
 from clrecon.mesh import Mesh
 from clrecon.rendering.looks.window import WINDOWS

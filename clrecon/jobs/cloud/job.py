@@ -180,8 +180,6 @@ class CloudFiles:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CloudReport(RunReport):
-    """The report of a cloud job; docs/contract.md explains its entries."""
-
     SCHEMA = "cloud"
 
     PARTS = ("device", "read", "mask", "steps", "surface", "write")

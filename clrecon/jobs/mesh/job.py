@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from clrecon.operators.resident.device_volume import DeviceVolume
     from clrecon.operators.surface.spans import MakeSpans
     from clrecon.system.files import StagedFile
-    from clrecon.system.progress import Progress
 
 
 _OF_ONE = ("quality", "walls", "iso_distance", "cortex", "refinement", "print", "cells", "growing")
@@ -348,23 +347,15 @@ class _PassingMeshes:
         self.paths: list[str | Path] = []
         self.files: list[StagedFile] = []
 
-    def extract(
-        self,
-        volume: Volume,
-        surfaces: Sequence[Surface],
-        device: Device,
-        settings: MeshSettings,
-        progress: Progress,
-        labels: LabelMap | None = None,
-    ) -> list[Mesh]:
+    def extract(self, volume: Volume, surfaces: Sequence[Surface], device: Device) -> list[Mesh]:
         """Write all surfaces; return for each a mesh without triangles, with its report."""
         from clrecon.jobs.mesh.workers import open_spans_in_order
         from clrecon.operators.resident.device_volume import DeviceVolume
 
         self.paths = name_outputs(self._output, [surface.name for surface in surfaces])
         with (
-            DeviceVolume(volume, device=device, memory=settings.memory) as resident,
-            open_spans_in_order(volume, settings, progress) as spans,
+            DeviceVolume(volume, device=device, memory=self._run.settings.memory) as resident,
+            open_spans_in_order(volume, self._run.settings, self._run.progress) as spans,
         ):
             return [self._write(resident, spans, *each) for each in zip(surfaces, self.paths, strict=True)]
 

@@ -66,7 +66,7 @@ def make_parts(
     source: str | Path,
     run: Run,
     check_map: Callable[[LabelMap], None] | None = None,
-    extract: Callable[..., list[Mesh]] | None = None,
+    extract: Callable[[Volume, Sequence[Surface], Device], list[Mesh]] | None = None,
 ) -> MadeParts:
     """Read a scan, extract its surfaces and select components.
 
@@ -93,8 +93,10 @@ def make_parts(
         surfaces, extracted = extract_label_surfaces(
             solid, surfaces, labels, settings.labels, device, settings, run.progress
         )
+    elif extract is not None:
+        extracted = extract(solid, surfaces, device)
     else:
-        extracted = (extract or extract_surfaces)(solid, surfaces, device, settings, run.progress, labels)
+        extracted = extract_surfaces(solid, surfaces, device, settings, run.progress, labels)
     origins = [mesh.report for mesh in extracted]
     make_solid = _remember_filled(volume, solid)
     del solid

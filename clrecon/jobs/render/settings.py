@@ -15,14 +15,7 @@ from clrecon.geometry import frame_from_lps
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.blocks import CROPS, Box, crop_box
 from clrecon.geometry.grid import Grid
-from clrecon.jobs.options import (
-    SharedSettings,
-    label_color_option,
-    label_map_option,
-    mesh_space_option,
-    size_option,
-    view_option,
-)
+from clrecon.jobs import options
 from clrecon.labels import LabelMap
 from clrecon.rendering.looks.colors import COLORS as COLORS
 from clrecon.rendering.looks.colors import find_color
@@ -113,8 +106,8 @@ class Turntable:
 class LabelLook:
     """A label map and the look of its labels, by number or name; of opacities "0" is for all that has no label."""
 
-    path: str = label_map_option(default=MISSING)
-    colors: Mapping[str, str] = label_color_option(", by name or number")
+    path: str = options.label_map_option(default=MISSING)
+    colors: Mapping[str, str] = options.label_color_option(", by name or number")
     opacities: Mapping[str, float] = option(
         "--label-opacity LABEL=SHARE",
         "multiply the opacity of a label by 0 to 1 (label 0: all without a label); over slices: share of its colour"
@@ -161,7 +154,7 @@ def color_apart(meshes: Sequence[MeshFile]) -> list[MeshFile]:
 
 
 @dataclass(frozen=True)
-class RenderSettings(SharedSettings):
+class RenderSettings(options.SharedSettings):
     """Settings of the render job, which makes pictures from a CT series; options say in their help what they do.
 
     style: What the pictures show.  The files below add to it, see `style_with`.
@@ -179,9 +172,9 @@ class RenderSettings(SharedSettings):
     curve: str | None = None
     labels: LabelLook | None = None
     meshes: Sequence[MeshFile] = ()
-    mesh_space: Space | None = mesh_space_option("meshes whose files do not name theirs", "meshes")
+    mesh_space: Space | None = options.mesh_space_option("meshes whose files do not name theirs", "meshes")
     light: str | Sequence[float] | None = None
-    views: Sequence[str] = view_option(
+    views: Sequence[str] = options.view_option(
         "V[,V...]|AZ,EL",
         f"place the camera: {', '.join(VIEWS)}; or degrees from anterior to the patient's left and to the head; for"
         " slices also axial, coronal, sagittal (default: anterior; in mode slice axial, in slices 30,30, in cpr left);"
@@ -202,7 +195,7 @@ class RenderSettings(SharedSettings):
         "LPS mm at the centre of the picture, also of a slice (default: the centre of what is shown)",
         parse=numbers_reader(3, "is not a place X,Y,Z in LPS mm, such as -12,40,310"),
     )
-    size: tuple[int, int] | None = size_option("pixels of the picture", group="camera", first=True)
+    size: tuple[int, int] | None = options.size_option("pixels of the picture", group="camera", first=True)
     view_angle: float | None = _camera_option(
         "--perspective DEGREES",
         f"perspective of this many degrees from bottom to top ({DEFAULT_VIEW_ANGLE:g} without a number; default:"

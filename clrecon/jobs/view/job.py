@@ -195,8 +195,6 @@ def _name_and_color(shown: Sequence[_ShownInput], settings: ViewSettings) -> lis
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ViewReport(JobReport):
-    """Report of `write_view`; docs/contract.md explains its entries."""
-
     SCHEMA = "page"
 
     _LAST = ("device", *JobReport._LAST)

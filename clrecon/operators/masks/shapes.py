@@ -14,16 +14,8 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Volume, slice_normal, slice_voxel_ml
 from clrecon.geometry.affine import Float64Array, checked_points
 from clrecon.opencl import Device
-from clrecon.operators.masks import voxel_mask
+from clrecon.operators.masks import runs, voxel_mask
 from clrecon.operators.masks.regions import checked_mm
-from clrecon.operators.masks.runs import (
-    Components,
-    RunList,
-    find_components,
-    mark_at_border,
-    mark_with_voxels,
-    write_runs,
-)
 from clrecon.operators.masks.voxel_mask import VoxelMask, mask_bytes, zero_words
 from clrecon.points.stencil import SLACK, Lattice, Stencil, make_stencil
 from clrecon.system.arguments import explains_arguments
@@ -413,12 +405,12 @@ class MaskComponents(MaskShapes):
         device, shape = self.device, self.shape_ijk
         size = mask_bytes(self.shape_ijk)["mask of the voxels"]
         rest = voxel_mask.find_extents(device, voxel_mask.invert(device, self._mask_d, shape), shape)
-        holes = find_components(device, rest, by_slice=by_slice, beside=2 * size, memory=self.memory)
+        holes = runs.find_components(device, rest, by_slice=by_slice, beside=2 * size, memory=self.memory)
         filled_d = ocl.allocate(device, size)
         ocl.copy_buffer(device, self._mask_d, filled_d, size)
         if holes.count:
-            marks_d = mark_at_border(device, holes, shape, by_slice=by_slice)
-            write_runs(self.device, holes, marks_d, filled_d, self.shape_ijk, wanted=0)
+            marks_d = runs.mark_at_border(device, holes, shape, by_slice=by_slice)
+            runs.write_runs(self.device, holes, marks_d, filled_d, self.shape_ijk, wanted=0)
         return self._made(filled_d, f"({self.name}) with holes filled" + " slice by slice" * by_slice)
 
     def grow(self: ComponentMask, points_mm: ArrayLike) -> ComponentMask:
@@ -433,14 +425,14 @@ class MaskComponents(MaskShapes):
         device, shape = self.device, self.shape_ijk
         size = mask_bytes(self.shape_ijk)["mask of the voxels"]
         voxels = self._find_voxels(points)
-        parts = find_components(device, self.bits, beside=size, memory=self.memory)
+        parts = runs.find_components(device, self.bits, beside=size, memory=self.memory)
         if not parts.count:
             raise UsageError(f"no voxel is chosen ({self.name}): nothing can grow")
-        marks_d, components = mark_with_voxels(device, parts, shape, voxels)
+        marks_d, components = runs.mark_with_voxels(device, parts, shape, voxels)
         if (components < 0).any():
             raise UsageError(self._describe_miss(points[components < 0][0], "lies in a voxel that is not chosen"))
         grown_d = zero_words(device, size // 4)
-        write_runs(self.device, parts, marks_d, grown_d, self.shape_ijk)
+        runs.write_runs(self.device, parts, marks_d, grown_d, self.shape_ijk)
         return self._made(grown_d, f"({self.name}) grown from {len(points)} point{'s' * (len(points) != 1)}")
 
     @explains_arguments
@@ -463,21 +455,21 @@ class MaskComponents(MaskShapes):
         label = "the largest component" if count == 1 else f"the {count} largest components"
         return self._choose(parts, np.argsort(-sizes, kind="stable")[:count], label)
 
-    def _measure_components(self, wanted: int) -> tuple[Components, Float64Array]:
+    def _measure_components(self, wanted: int) -> tuple[runs.Components, Float64Array]:
         if isinstance(wanted, bool) or not isinstance(wanted, int | np.integer) or wanted < 1:
             raise UsageError(f"a number of components is a whole number from 1 on, not {wanted!r}")
         size = mask_bytes(self.shape_ijk)["mask of the voxels"]
-        parts = find_components(self.device, self.bits, beside=2 * size, memory=self.memory)
+        parts = runs.find_components(self.device, self.bits, beside=2 * size, memory=self.memory)
         if not parts.count:
             return parts, np.empty(0)
-        return parts, RunList.read(self.device, parts, self.shape_ijk).sum_ml(self.scan, parts.count)
+        return parts, runs.RunList.read(self.device, parts, self.shape_ijk).sum_ml(self.scan, parts.count)
 
-    def _choose(self: ComponentMask, parts: Components, numbers: NDArray[np.integer], label: str) -> ComponentMask:
+    def _choose(self: ComponentMask, parts: runs.Components, numbers: NDArray[np.integer], label: str) -> ComponentMask:
         chosen_d = zero_words(self.device, mask_bytes(self.shape_ijk)["mask of the voxels"] // 4)
         if len(numbers):
             marks = np.zeros(4 * -(-parts.count // 4), np.uint8)
             marks[numbers] = 1
-            write_runs(self.device, parts, ocl.upload(self.device, marks), chosen_d, self.shape_ijk)
+            runs.write_runs(self.device, parts, ocl.upload(self.device, marks), chosen_d, self.shape_ijk)
         return self._made(chosen_d, f"{label} of ({self.name})")
 
     def _find_voxels(self, points: Float64Array) -> NDArray[np.int32]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from itertools import product
 from typing import Any
 
@@ -13,7 +14,7 @@ from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
 from clrecon.labels import ResampledLabels
 from clrecon.opencl import Stopwatch, allocate, launch, upload
-from clrecon.operators.rays.ray_slabs import RaySlab, ray_slabs, slab_labels, upload_part
+from clrecon.operators.rays.ray_slabs import OPENNESS, RaySlab, SlabPicture, ray_slabs, slab_labels, upload_part
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.tables import FieldFrame, label_variants
 from clrecon.rendering.pictures.label_style import LabelStyle
@@ -124,10 +125,45 @@ class Hiding:
     grown: bool = False
 
 
-def hiding_key(planes: Float64Array | None, look: LabelStyle | None) -> tuple[object, ...]:
-    """Return what clip planes and labels decide about the openness, for what keeps it."""
-    hidden = None if look is None else (look.labels, look.table[:, 3].tobytes())  # a label map equals only itself
-    return None if planes is None else planes.tobytes(), hidden
+class HollowedPicture(SlabPicture):
+    """A picture in which hollows lose up to a share of the light, `darkening`."""
+
+    darkening = 0.0
+    openness: Openness | None = None
+    _key: tuple[object, ...] = ()
+
+    def darken_hollows(self, share: float, shown: object, planes: Float64Array | None, look: LabelStyle | None) -> None:
+        """Reckon with the openness of the volume, which `shown`, clip planes and labels decide."""
+        self.darkening = share
+        if share > 0.0:
+            hidden = None if look is None else (look.labels, look.table[:, 3].tobytes())  # a map equals only itself
+            self._key = shown, None if planes is None else planes.tobytes(), hidden
+            cells = OpenCells.of(self.resident.volume)
+            self.beside = {OPENNESS: cells.device_bytes(self.resident.dtype.itemsize)}
+
+    @abstractmethod
+    def hide_light(self, length_mm: float) -> Hiding:
+        """Return what of the volume hides light, over a length."""
+
+    def find_openness(self, slices: int) -> None:
+        """Find the openness where hollows are darkened; that of a whole volume is kept."""
+        if self.darkening == 0.0:
+            return
+        resident, length_mm = self.resident, OpenCells.of(self.resident.volume).length_mm
+
+        def make_openness() -> Openness:
+            return find_openness(resident, slices, self.hide_light(length_mm), self.stopwatch)
+
+        if slices < resident.volume.shape_ijk[2]:
+            self.openness = make_openness()
+        else:
+            self.openness = resident.keep(OPENNESS, self._key, sum(self.beside.values()), make_openness)
+
+    def add_openness(self, variants: dict[str, str], arguments: dict[str, Any]) -> None:
+        """Add what a kernel needs to know of the openness, if it was found."""
+        if self.openness is not None:
+            variants["OPENNESS"] = "1"
+            arguments.update(self.openness.arguments(self.darkening))
 
 
 def find_openness(resident: DeviceVolume, slices: int, hiding: Hiding, stopwatch: Stopwatch) -> Openness:

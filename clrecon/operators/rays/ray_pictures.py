@@ -16,7 +16,7 @@ from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.iso_rule import takes_parts
 from clrecon.opencl import Device, allocate, building_together, kernel_constant, kernel_number, launch, upload
 from clrecon.operators.rays import ray_slabs
-from clrecon.operators.rays.openness import Hiding, OpenCells, Openness, find_openness, hiding_key
+from clrecon.operators.rays.openness import Hiding, HollowedPicture
 from clrecon.operators.rays.picture_buffers import (
     NEAR_ROW,
     Between,
@@ -263,7 +263,7 @@ def take_with_layers(
     return picture
 
 
-class _Job(ray_slabs.SlabPicture):
+class _Job(HollowedPicture):
     def __init__(
         self, resident: DeviceVolume, style: VolumeLook | Projection, shot: Shot, ray_step: float, warnings: list[str]
     ):
@@ -278,30 +278,13 @@ class _Job(ray_slabs.SlabPicture):
             if sigma is None:
                 sigma = resident.keep("smoothing of light", None, 0, lambda: choose_smoothing(resident.volume))
             self.smoothing = ray_slabs.Smoothing.of(resident.volume, sigma)
-        self.openness: Openness | None = None
-        if isinstance(style, VolumeLook) and style.ambient_occlusion > 0.0:
-            cells = OpenCells.of(resident.volume)
-            self.beside = {ray_slabs.OPENNESS: cells.device_bytes(resident.dtype.itemsize)}
+        if isinstance(style, VolumeLook):
+            self.darken_hollows(style.ambient_occlusion, style.function, self.planes, style.label_style)
 
-    def find_openness(self, slices: int) -> None:
-        """Find the openness of the volume where the style darkens hollows; that of a whole volume is kept."""
-        style, resident = self.style, self.resident
-        if not isinstance(style, VolumeLook) or style.ambient_occlusion == 0.0:
-            return
-        length = OpenCells.of(resident.volume).length_mm
-        look = style.label_style
-
-        def make_openness() -> Openness:
-            tables = TransferTables.of(resident.device, style.function, length)
-            labels = None if look is None else self.labels
-            hiding = Hiding(tables.opacities_d, NODES, tables.low, tables.scale, self.planes, labels, look, grown=True)
-            return find_openness(resident, slices, hiding, self.stopwatch)
-
-        if slices < resident.volume.shape_ijk[2]:
-            self.openness = make_openness()
-            return
-        key = ("dvr", style.function, *hiding_key(self.planes, look))
-        self.openness = resident.keep(ray_slabs.OPENNESS, key, sum(self.beside.values()), make_openness)
+    def hide_light(self, length_mm: float) -> Hiding:
+        assert isinstance(self.style, VolumeLook)
+        tables, look = TransferTables.of(self.resident.device, self.style.function, length_mm), self.style.label_style
+        return Hiding(tables.opacities_d, NODES, tables.low, tables.scale, self.planes, self.labels, look, grown=True)
 
     def take(self, slices: int) -> Rendering:
         style = self.style
@@ -356,9 +339,7 @@ class _Job(ray_slabs.SlabPicture):
             variants |= {"LABELS": "1", **label_variants(self.labels.voxels.dtype)}
             more["labels"] = ray_slabs.slab_labels(resident, slab, self.labels, stopwatch, grown=True)
             more["label_colors"] = upload(device, look.table)
-        if self.openness is not None:
-            variants |= {"OPENNESS": "1"}
-            more |= self.openness.arguments(style.ambient_occlusion)
+        self.add_openness(variants, more)
         if between is not None:
             variants |= {"BETWEEN": "1"}
             more |= {"nearest": between.nearest_d, "farthest": between.farthest_d, "stage": 0}

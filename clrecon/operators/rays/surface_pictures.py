@@ -13,9 +13,9 @@ from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule, choose_iso_rule
 from clrecon.labels.label_levels import Growth
 from clrecon.opencl import launch, memory_limits, upload
-from clrecon.operators.rays.openness import Hiding, OpenCells, Openness, find_openness, hiding_key
+from clrecon.operators.rays.openness import Hiding, HollowedPicture
 from clrecon.operators.rays.picture_buffers import PictureBuffers, RayView, Shot, count_queues, highlight_table
-from clrecon.operators.rays.ray_slabs import OPENNESS, LeapMap, RaySlab, SlabPicture, find_leaps, slab_labels
+from clrecon.operators.rays.ray_slabs import LeapMap, RaySlab, find_leaps, slab_labels
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.tables import FieldFrame, enclose, label_variants
 from clrecon.rendering import Rendering
@@ -48,7 +48,7 @@ def cast_surface(resident: DeviceVolume, style: SurfaceLook, shot: Shot, ray_ste
     return picture
 
 
-class _Job(SlabPicture):
+class _Job(HollowedPicture):
     """One picture, slab after slab."""
 
     def __init__(
@@ -59,28 +59,12 @@ class _Job(SlabPicture):
         self.style = look.label_style
         self.planes = np.empty((0, 4)) if look.clip is None else look.clip.planes
         self.frame = FieldFrame.of(resident.volume)
-        self.openness: Openness | None = None
-        if look.ambient_occlusion > 0.0:
-            self.beside = {OPENNESS: OpenCells.of(resident.volume).device_bytes(resident.dtype.itemsize)}
+        self.hiding_planes = self.planes if len(self.planes) else None
+        self.darken_hollows(look.ambient_occlusion, rule.iso_level, self.hiding_planes, self.style)
 
-    def _find_openness(self, slices: int) -> None:
-        """Find the openness of the volume where the style darkens hollows; that of a whole volume is kept."""
-        if self.look.ambient_occlusion == 0.0:
-            return
-        resident, planes = self.resident, self.planes if len(self.planes) else None
-
-        def make_openness() -> Openness:
-            low, scale = _level_nodes(self.rule.iso_level)
-            table_d = upload(resident.device, np.array([0.0, 1.0], np.float32))
-            labels = None if self.style is None else self.labels
-            hiding = Hiding(table_d, 2, low, scale, planes, labels, self.style)
-            return find_openness(resident, slices, hiding, self.stopwatch)
-
-        if slices < resident.volume.shape_ijk[2]:
-            self.openness = make_openness()
-            return
-        key = ("surface", self.rule.iso_level, *hiding_key(planes, self.style))
-        self.openness = resident.keep(OPENNESS, key, sum(self.beside.values()), make_openness)
+    def hide_light(self, length_mm: float) -> Hiding:
+        table_d = upload(self.resident.device, np.array([0.0, 1.0], np.float32))
+        return Hiding(table_d, 2, *_level_nodes(self.rule.iso_level), self.hiding_planes, self.labels, self.style)
 
     def take(self, slices: int) -> Rendering:
         resident, nk = self.resident, self.resident.volume.shape_ijk[2]
@@ -92,7 +76,7 @@ class _Job(SlabPicture):
                     f" {limits.describe()}; give more memory or leave the shadows out"
                 )
             self._shorten_steps()
-        self._find_openness(slices)
+        self.find_openness(slices)
         output, slabs = self.draw_slabs(slices)
         with self.stopwatch.timed("download"):
             image, late = output.download_image()
@@ -146,9 +130,7 @@ class _Job(SlabPicture):
                 "near": upload(device, near),
                 "offsets": len(near),
             }
-        if self.openness is not None:
-            variants |= {"OPENNESS": "1"}
-            tables |= self.openness.arguments(self.look.ambient_occlusion)
+        self.add_openness(variants, tables)
         return variants, tables
 
     def _view(self, leaps: LeapMap) -> RayView:

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from coded_pages import decode_surface, parse_slices, unpack_slices
 from command_lines import check_refused
 from sample_meshes import ball
 
 import clrecon
 from clrecon.cli.main import main
-from clrecon.exchange.page import decode_surface, parse_page, parse_slices
-from clrecon.exchange.page_slices import unpack_slices
+from clrecon.exchange.page import parse_page
 from clrecon.geometry import Volume
 from clrecon.mesh import Mesh
 

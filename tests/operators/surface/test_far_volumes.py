@@ -7,11 +7,12 @@ import itertools
 import numpy as np
 import pytest
 import tolerances
+from coded_pages import decode_surface
 
 import clrecon
 from clrecon.exchange.coordinates import find_coincident
 from clrecon.exchange.formats import FORMATS, describe_rounding
-from clrecon.exchange.page import decode_surface, parse_page, read_facts
+from clrecon.exchange.page import parse_page, read_facts
 from clrecon.geometry import Volume
 from clrecon.geometry.vertices import FAR_MM, find_vertex_origin, float32_step
 from clrecon.labels import LabelMap

@@ -21,23 +21,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, cast
 
-from clrecon.reading.dicom.parse.plain import (
-    DEFLATED,
-    EXPLICIT_BIG,
-    EXPLICIT_LITTLE,
-    FIRST_PIXEL_TAG,
-    IMPLICIT_LITTLE,
-    MEDIA_CLASS,
-    META_START,
-    TRANSFER_SYNTAX,
-    UNDEFINED_LENGTH,
-    CorruptFileError,
-    DicomElements,
-    NotDicomError,
-    decode_uid,
-    parse_plainly,
-    read_pixel_head,
-)
+from clrecon.reading.dicom.parse import plain
+from clrecon.reading.dicom.parse.plain import CorruptFileError, DicomElements
 from clrecon.reading.dicom.parse.values import name_tag
 from clrecon.system.arguments import name_parameter
 from clrecon.system.paths import open_regular
@@ -48,9 +33,9 @@ _FIRST_GROUP = 0x0008
 _FIRST_LENGTH_LIMIT = 1024
 """Longest first element: data sets begin with short ones, such as group length, character set, type or date."""
 ENCODINGS = {
-    IMPLICIT_LITTLE: "implicit VR little endian",
-    EXPLICIT_LITTLE: "explicit VR little endian",
-    EXPLICIT_BIG: "explicit VR big endian",
+    plain.IMPLICIT_LITTLE: "implicit VR little endian",
+    plain.EXPLICIT_LITTLE: "explicit VR little endian",
+    plain.EXPLICIT_BIG: "explicit VR big endian",
 }
 _PROGRAMS = {
     b"MZ": "Windows",
@@ -95,18 +80,18 @@ def _guess_syntax(head: bytes) -> str | None:
     if len(head) < 8:
         return None
     explicit = all(0x41 <= letter <= 0x5A for letter in head[4:6])
-    for syntax, order in ((EXPLICIT_LITTLE, "<"), (EXPLICIT_BIG, ">")):
+    for syntax, order in ((plain.EXPLICIT_LITTLE, "<"), (plain.EXPLICIT_BIG, ">")):
         group, length = struct.unpack(order + "H4xH", head)
         if group == _FIRST_GROUP and explicit and length < _FIRST_LENGTH_LIMIT:
             return syntax
     group, length = struct.unpack("<H2xL", head)
-    return IMPLICIT_LITTLE if group == _FIRST_GROUP and length < _FIRST_LENGTH_LIMIT and not explicit else None
+    return plain.IMPLICIT_LITTLE if group == _FIRST_GROUP and length < _FIRST_LENGTH_LIMIT and not explicit else None
 
 
 INFLATE_STEP = 1 << 18
 ITEM = b"\xfe\xff\x00\xe0"
 """Stands for a wanted sequence of undefined length: only whether it is there is asked."""
-_META_TAGS = (MEDIA_CLASS, TRANSFER_SYNTAX)
+_META_TAGS = (plain.MEDIA_CLASS, plain.TRANSFER_SYNTAX)
 _DESCRIPTIVE_TAGS = (0x00080005, 0x0008103E)
 """SpecificCharacterSet and SeriesDescription.  They only describe, so two different values in one file do no harm."""
 
@@ -155,26 +140,26 @@ class _MeteredFile:
 
 
 def _parse_file(file: BinaryIO, size: int, wanted: tuple[int, ...] | None) -> DicomElements:
-    file.seek(META_START)
+    file.seek(plain.META_START)
     meta, _, meta_remarks = _collect_values(file, implicit=False, little=True, last_group=2, wanted=())
-    transfer_syntax = decode_uid(meta.get(TRANSFER_SYNTAX))
-    media_class = decode_uid(meta.get(MEDIA_CLASS))
+    transfer_syntax = plain.decode_uid(meta.get(plain.TRANSFER_SYNTAX))
+    media_class = plain.decode_uid(meta.get(plain.MEDIA_CLASS))
     if not transfer_syntax:
         raise CorruptFileError("no transfer syntax (0002,0010)")
 
     start = file.tell()
     inflate_from = -1
-    if transfer_syntax == DEFLATED:
+    if transfer_syntax == plain.DEFLATED:
         inflate_from, start = start, 0
         file = cast(BinaryIO, _MeteredFile(io.BytesIO(_inflate_header(file))))
-    little = transfer_syntax != EXPLICIT_BIG
-    implicit = transfer_syntax == IMPLICIT_LITTLE
+    little = transfer_syntax != plain.EXPLICIT_BIG
+    implicit = transfer_syntax == plain.IMPLICIT_LITTLE
     seen_implicit = _looks_implicit(file, start)
     differs = seen_implicit is not None and seen_implicit != implicit
     implicit = implicit if seen_implicit is None else seen_implicit
     values, vrs, remarks = _collect_values(file, implicit=implicit, little=little, last_group=None, wanted=wanted)
     position = file.tell()
-    tag, offset, length, vr = read_pixel_head(file.read(12), position, implicit, little)
+    tag, offset, length, vr = plain.read_pixel_head(file.read(12), position, implicit, little)
     return DicomElements(
         transfer_syntax,
         media_class,
@@ -199,7 +184,7 @@ def _collect_values(
     from pydicom.filereader import data_element_generator
 
     def stop(tag: int, vr: str | None, length: int) -> bool:
-        return tag >> 16 != last_group if last_group is not None else int.__ge__(tag, FIRST_PIXEL_TAG)
+        return tag >> 16 != last_group if last_group is not None else int.__ge__(tag, plain.FIRST_PIXEL_TAG)
 
     values: dict[int, bytes] = {}
     vrs: dict[int, str | None] = {}
@@ -213,7 +198,7 @@ def _collect_values(
     ):
         value = element.value
         if isinstance(value, bytes) and value:
-            if element.length not in (len(value), UNDEFINED_LENGTH):
+            if element.length not in (len(value), plain.UNDEFINED_LENGTH):
                 raise CorruptFileError("ends within an element")
             values[int(element.tag)] = value
             vrs[int(element.tag)] = element.VR
@@ -318,7 +303,7 @@ def read_start(path: str | Path, limit: int = PREFIX_BYTES) -> FileStart:
 
 def has_dicom_mark(prefix: bytes) -> bool:
     """True when the bytes carry the mark of a DICOM file behind the preamble."""
-    return prefix[128:META_START] == b"DICM"
+    return prefix[128 : plain.META_START] == b"DICM"
 
 
 def read_elements(
@@ -330,7 +315,7 @@ def read_elements(
     if restored is not None and force:
         return _read_restored(path, restored, size, wanted)
     if not has_dicom_mark(prefix):
-        raise NotDicomError("no DICM mark at byte 128", prefix)
+        raise plain.NotDicomError("no DICM mark at byte 128", prefix)
     if restored is not None:
         raise CorruptFileError(f"no meta header ({describe_way_out()})")
     elements = _read_marked(path, prefix, size, wanted)
@@ -359,10 +344,10 @@ def _read_restored(path: Path, restored: Start, size: int, wanted: tuple[int, ..
 
 
 def _read_marked(path: Path, prefix: bytes, size: int, wanted: tuple[int, ...] | None) -> DicomElements:
-    elements = parse_plainly(prefix, size, wanted)
+    elements = plain.parse_plainly(prefix, size, wanted)
     if elements is None and len(prefix) < size:
         prefix, size = read_start(path, _LONG_PREFIX_BYTES)
-        elements = parse_plainly(prefix, size, wanted)
+        elements = plain.parse_plainly(prefix, size, wanted)
     if elements is not None:
         return elements
     if len(prefix) >= size:
@@ -376,7 +361,7 @@ def _read_marked(path: Path, prefix: bytes, size: int, wanted: tuple[int, ...] |
     for limit in _LONGEST_PREFIX_BYTES:
         if len(prefix) < size:
             prefix, size = read_start(path, limit)
-            elements = parse_plainly(prefix, size, wanted)
+            elements = plain.parse_plainly(prefix, size, wanted)
             if elements is not None:
                 return elements
     del prefix

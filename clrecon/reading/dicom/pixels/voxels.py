@@ -31,7 +31,8 @@ from clrecon.reading.common.padding import (
 )
 from clrecon.reading.common.source_facts import PixelFacts
 from clrecon.reading.dicom.headers.slice_header import SliceHeader
-from clrecon.reading.dicom.parse.elements import CorruptFileError, NotDicomError, read_elements
+from clrecon.reading.dicom.parse.elements import read_elements
+from clrecon.reading.dicom.parse.plain import CorruptFileError, NotDicomError
 from clrecon.reading.dicom.pixels.stored import StoredPixels
 from clrecon.system.memory import allocate_voxels
 from clrecon.system.pieces import count_readers

@@ -36,15 +36,8 @@ from clrecon.errors import NoDicomError, RefusedInputError
 from clrecon.reading.common.selection import Rescale
 from clrecon.reading.dicom.headers.header import read_headers
 from clrecon.reading.dicom.headers.slice_header import OtherImage, SliceHeader
-from clrecon.reading.dicom.parse.elements import (
-    META_START,
-    CorruptFileError,
-    FileStart,
-    describe_way_out,
-    has_dicom_mark,
-    read_start,
-    restore_start,
-)
+from clrecon.reading.dicom.parse.elements import FileStart, describe_way_out, has_dicom_mark, read_start, restore_start
+from clrecon.reading.dicom.parse.plain import META_START, CorruptFileError
 from clrecon.system.arguments import name_parameter
 from clrecon.system.light_dataclass import dataclass, field
 from clrecon.system.progress import Progress

@@ -20,7 +20,8 @@ from typing import Literal
 import numpy as np
 
 from clrecon.reading.dicom.headers.slice_header import SliceHeader
-from clrecon.reading.dicom.parse.elements import CorruptFileError, NotDicomError, read_elements
+from clrecon.reading.dicom.parse.elements import read_elements
+from clrecon.reading.dicom.parse.plain import CorruptFileError, NotDicomError
 from clrecon.reading.dicom.parse.values import name_element
 from clrecon.reading.dicom.stack.fit import median
 from clrecon.system.light_dataclass import dataclass
