@@ -26,6 +26,16 @@ def list_usable() -> list[Device]:
     return devices
 
 
+def check_indexes(text: str, named_by: str) -> None:
+    """Refuse indexes of devices that are not there; a worker would find out, and not know who named them."""
+    from clrecon.opencl import list_devices
+
+    known = [str(device.index) for device in list_devices()]
+    unknown = [index for index in map(str.strip, text.split(",")) if index not in known]
+    if unknown:
+        raise DeviceError(f"{named_by}: no device {', '.join(unknown)}; there are {', '.join(known) or 'none'}")
+
+
 def survey_devices(name: str | None = None) -> tuple[dict[str, Any], DeviceError | None]:
     """List every OpenCL platform and device, as docs/contract.md says, and which would be used, or why none would."""
     from clrecon.opencl import cache_warnings, choose_remembered, list_devices, list_platforms, remembered_fault

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, get_args
 from clrecon.errors import NoDicomError, UsageError
 from clrecon.exchange.formats import CLOUD_FORMATS, MESH_INPUTS
 from clrecon.jobs.cluster import LOCAL
-from clrecon.jobs.devices import list_usable
+from clrecon.jobs.devices import check_indexes, list_usable
 from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.jobs.options import ALL_DEVICES, DeviceSettings, ScanSettings, scheduler_option, view_option
 from clrecon.reading import tell_format
@@ -26,7 +26,7 @@ from clrecon.system.arguments import DirectionName, name_parameter
 from clrecon.system.light_dataclass import asdict, dataclass, fields, replace
 from clrecon.system.options import option
 from clrecon.system.packages import import_package
-from clrecon.system.paths import find_extension, open_regular, shown_path
+from clrecon.system.paths import open_regular, shown_path
 from clrecon.system.text import escape_text, guess_word, unknown_name
 from clrecon.version import package_version
 
@@ -50,6 +50,11 @@ def _parse_statuses(text: str) -> tuple[str, ...]:
         if status not in _STATUSES:
             raise ValueError(unknown_name("status", status, _STATUSES))
     return statuses
+
+
+def _check_extension(parameter: str, extension: str, known: Iterable[str]) -> None:
+    if extension not in known:
+        raise UsageError(f"{name_parameter(parameter)}: {unknown_name('format', extension, known)}")
 
 
 def _parse_extension(text: str) -> str:
@@ -147,9 +152,9 @@ class BatchSettings:
     )
 
     def __post_init__(self) -> None:
-        find_extension(f"mesh{self.format}", MESH_INPUTS, "mesh")
+        _check_extension("format", self.format, MESH_INPUTS)
         if self.cloud is not None:
-            find_extension(f"cloud{self.cloud}", CLOUD_FORMATS, "cloud")
+            _check_extension("cloud", self.cloud, CLOUD_FORMATS)
         if self.workers is not None and not 1 <= self.workers <= _MOST_WORKERS:
             raise UsageError(f"a batch takes 1 to {_MOST_WORKERS} workers, not {self.workers}")
         if self.devices not in (None, ALL_DEVICES) and not all(
@@ -171,6 +176,7 @@ class BatchSettings:
             devices = [str(device.index) for device in list_usable()]
         elif self.devices is not None:
             devices = [*map(str.strip, self.devices.split(","))]
+            check_indexes(self.devices, name_parameter("devices"))
         return [devices[number % len(devices)] for number in range(self.workers or len(devices))]
 
 
@@ -300,7 +306,10 @@ def _read_table(path: str | Path) -> list[Case]:
                 places = _find_columns(name, next(table, []))
                 cases = _read_rows(name, ((table.line_num, row) for row in table), places, folder)
     except (UnicodeDecodeError, csv.Error) as error:
-        raise UsageError(f"the manifest {name} is no table in UTF-8 with commas or semicolons: {error}") from None
+        where = error if isinstance(error, csv.Error) else "it is no text in UTF-8"
+        raise UsageError(
+            f"the manifest {name} is no table with commas or semicolons: {where}; save it as CSV in UTF-8"
+        ) from None
     except OSError as error:
         raise UsageError(f"the manifest {name} cannot be read: {error.strerror or error}") from None
     if not cases:

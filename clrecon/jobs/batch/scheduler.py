@@ -129,7 +129,7 @@ class LocalScheduler:
                     running -= 1
                 elif isinstance(outcome, Exception):
                     raise outcome
-                elif outcome.death and count > 1:
+                elif outcome.death:
                     lost.append(outcome.case)
                 else:
                     yield outcome

@@ -226,7 +226,10 @@ class Extraction:
         try:
             return _join_parts(self.parts)
         except MemoryError as error:
-            raise DeviceError(f"the mesh does not fit the memory of this computer: {error}") from error
+            raise DeviceError(
+                f"the mesh does not fit the memory of this computer ({error}): crop the volume, or write the mesh slab"
+                " by slab (docs/mesh.md, meshes larger than the memory)"
+            ) from error
 
     def facts(self) -> SpanFacts:
         """Return what `take_spans` adds to the report of the whole."""

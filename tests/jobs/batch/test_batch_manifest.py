@@ -12,7 +12,7 @@ from ct_files import write_series
 from refusals import refused
 
 from clrecon.cli.main import main
-from clrecon.errors import NoDicomError, UsageError
+from clrecon.errors import DeviceError, NoDicomError, UsageError
 from clrecon.jobs.batch.plan import BatchSettings, Case, check_places, read_cases
 from clrecon.jobs.options import ScanSettings
 from clrecon.opencl import list_devices
@@ -71,6 +71,23 @@ def test_manifest_that_is_no_text_or_missing_is_refused_with_its_name(content: b
         path.write_bytes(content)
     with refused(UsageError, "scan.csv"):
         read_cases(path, ScanSettings())
+
+
+def test_manifest_in_utf_16_is_refused_with_the_encoding_to_save_it_in(tmp_path: Path) -> None:
+    (tmp_path / "cohort.csv").write_text("case,input\na,x\n", encoding="utf-16")
+    with refused(UsageError, "cohort.csv", "UTF-8") as refusal:
+        read_cases(tmp_path / "cohort.csv", ScanSettings())
+    assert "codec" not in str(refusal.value)
+
+
+def test_unknown_format_of_meshes_is_refused_with_the_parameter_that_names_it() -> None:
+    with refused(UsageError, "format", "xyz", "stl"):
+        BatchSettings(format=".xyz")
+
+
+def test_index_of_no_device_is_refused_with_the_parameter_that_names_it() -> None:
+    with refused(DeviceError, "devices", 99):
+        BatchSettings(devices="99").deal_devices()
 
 
 @pytest.mark.seconds

@@ -64,28 +64,35 @@ def statuses(folder: Path) -> dict[str, str]:
         return {row["case"]: row["status"] for row in csv.DictReader(stream)}
 
 
-def test_case_of_a_killed_worker_is_lost_alone_and_named_with_the_signal_and_resume_makes_it(
-    tmp_path: Path, small_cases: list[str]
-) -> None:
+def test_case_of_a_killed_worker_is_made_again(tmp_path: Path, small_cases: list[str]) -> None:
     process = start_batch(tmp_path)
     first_case = tmp_path / "out" / small_cases[0]
     wait_until(process, first_case.exists)  # no kernel is built any more, whose file could be cut
     (worker,) = children_of(process.pid)
     os.kill(worker, signal.SIGKILL)
     _, errors = process.communicate(timeout=240)
+    assert process.returncode == 0, errors
+    assert statuses(tmp_path) == dict.fromkeys(small_cases, "done")
 
-    assert process.returncode == SOME_CASES_NOT_DONE
-    found = statuses(tmp_path)
-    (lost,) = (case for case, status in found.items() if status == "lost")
-    assert found == dict.fromkeys(small_cases, "done") | {lost: "lost"}
-    assert lost in errors and "SIGKILL" in errors
-    report = json.loads((tmp_path / "out" / lost / "case.json").read_text())
-    assert "SIGKILL" in report["error"]["message"]
+
+def test_case_whose_process_is_killed_twice_is_lost_with_the_signal_and_resume_makes_it(tmp_path: Path) -> None:
+    write_ball(tmp_path / "small", size=24)
+    write_manifest(tmp_path, {"only": "small"})
+    process = start_batch(tmp_path)
+    killed: set[int] = set()
+    for _ in range(2):
+        wait_until(process, lambda: bool({*children_of(process.pid)} - killed))
+        (worker,) = {*children_of(process.pid)} - killed
+        os.kill(worker, signal.SIGKILL)
+        killed.add(worker)
+    _, errors = process.communicate(timeout=240)
+    assert process.returncode == SOME_CASES_NOT_DONE, errors
+    assert statuses(tmp_path) == {"only": "lost"}
+    assert "SIGKILL" in json.loads((tmp_path / "out" / "only" / "case.json").read_text())["error"]["message"]
 
     again = start_batch(tmp_path, "--resume", "--json")
-    resumed = json.loads(again.communicate(timeout=240)[0])
+    assert json.loads(again.communicate(timeout=240)[0])["made"] == 1
     assert again.returncode == 0
-    assert (resumed["made"], resumed["kept"]) == (1, len(small_cases) - 1)
 
 
 def test_cases_of_two_killed_workers_are_made_again(tmp_path: Path) -> None:
