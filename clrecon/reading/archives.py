@@ -80,7 +80,8 @@ def unpacked(
             _Unpacking(file, folder, progress, limits).unpack(file, folder)
         except (zipfile.BadZipFile, tarfile.TarError, zlib.error, lzma.LZMAError, EOFError, OSError) as error:
             reason = escape_text(getattr(error, "strerror", None) or str(error), 120)
-            raise RefusedInputError(f"{escape_text(file.name)} cannot be unpacked: {reason}") from None
+            advice = "" if isinstance(error, OSError) and error.errno else ": it is cut or damaged, get it again"
+            raise RefusedInputError(f"{escape_text(file.name)} cannot be unpacked ({reason}){advice}") from None
         inside = list(folder.iterdir())
         yield inside[0] if len(inside) == 1 else folder
 
@@ -140,6 +141,11 @@ class _Unpacking:
                 self._progress("unpack", number, len(entries))
                 target = folder.joinpath(*safe_parts(entry.name, self._name))
                 target.parent.mkdir(parents=True, exist_ok=True)
+                if target.exists():
+                    raise RefusedInputError(
+                        f"{self._name} holds {escape_text(entry.name, 80)} twice: unpack it yourself, and name the"
+                        " folder"
+                    )
                 with archive.open(entry) as source, target.open("xb") as written:
                     copyfileobj(source, written, _PIECE)
         files = [path for path in folder.rglob("*") if path.is_file()]

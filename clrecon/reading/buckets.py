@@ -14,7 +14,7 @@ from urllib.parse import SplitResult, unquote
 
 from clrecon.errors import ClreconError, NoDicomError, RefusedInputError, UnreachableError, UsageError
 from clrecon.reading.archives import Limits, safe_parts
-from clrecon.reading.urls import Entry, Room, shown_url
+from clrecon.reading.urls import BUCKETS, Entry, Room, shown_url
 from clrecon.system.packages import import_package
 from clrecon.system.progress import Progress
 from clrecon.system.text import escape_text
@@ -183,19 +183,32 @@ _METADATA = ("169.254.169.254", "metadata.google")
 """Addresses at which a machine of the cloud would find its credentials; elsewhere nobody answers there."""
 
 
+def _find_advice(name: str) -> str:
+    """Return the variables for the credentials of a bucket."""
+    scheme = name.partition(":")[0].lower()
+    if scheme in ("s3", "s3a"):
+        return "AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_SKIP_SIGNATURE=true for a public bucket,"
+    if scheme == "gs":
+        return "GOOGLE_APPLICATION_CREDENTIALS, or GOOGLE_SKIP_SIGNATURE=true for a public bucket,"
+    if scheme in BUCKETS:
+        return "AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY, or AZURE_SKIP_SIGNATURE=true,"
+    return "those of its server"
+
+
 def _translate(name: str, kind: str, text: str) -> ClreconError:
+    if kind == "IsADirectoryError":
+        return NoDicomError(f"{name} is a folder without a file that can be read")
     match = _STATUS.search(text)
     status = int(match[1]) if match else 0
     if status == 404:
         return NoDicomError(f"there is nothing at {name}")
     if kind in _DENIED or status in (401, 403) or any(address in text for address in _METADATA):
         return UsageError(
-            f"{name} wants other credentials: set them in the environment, or AWS_SKIP_SIGNATURE=true for a public"
-            " bucket (docs/sources.md)"
+            f"{name} wants other credentials: set {_find_advice(name)} in the environment (docs/sources.md)"
         )
     if kind == "InvalidPathError":
         return RefusedInputError(f"{name} holds a path that leads out of it, or is none")
-    if "redirect" in text:
+    if "redirect" in text and name.startswith("s3"):
         return UsageError(f"{name} lies in another region: set AWS_REGION to it")
     reason = f"it answers {status}" if status else f"{kind}, {'no answer' if 'request' in text else 'no sound answer'}"
     return UnreachableError(f"{name} cannot be reached, or fails: {reason}; try again later")

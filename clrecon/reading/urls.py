@@ -56,8 +56,8 @@ def check_url(url: str) -> SplitResult:
     scheme = parts.scheme
     if password is not None or ("@" in parts.netloc and scheme in (*DICOMWEB, *WEB)):
         raise UsageError(
-            f"the URL of {host} holds a user or a password, which others can see: take them out, and put them into the"
-            " netrc file or the environment (docs/sources.md)"
+            f"the URL of {host or scheme} holds a user or a password, which others can see: take them out, and put them"
+            " into the netrc file or the environment (docs/sources.md)"
         )
     if not url.isprintable() or " " in url:
         raise UsageError(f"the URL {shown_url(url)} holds blanks or control characters: write them as %20 and so on")

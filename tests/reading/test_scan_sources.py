@@ -20,6 +20,7 @@ from clrecon import list_series, read_labels, read_volume
 from clrecon.cli.main import main
 from clrecon.errors import NoDicomError, RefusedInputError, UnreachableError, UsageError
 from clrecon.reading.archives import Limits
+from clrecon.reading.buckets import foreign_errors
 from clrecon.reading.sources import opened
 from clrecon.reading.urls import check_url, is_url, shown_url
 from clrecon.system.progress import ignore_progress
@@ -317,3 +318,16 @@ def test_modules_of_the_network_are_not_loaded_for_a_folder(scan: Path) -> None:
     loaded = subprocess.run([sys.executable, "-c", code, str(scan)], capture_output=True, text=True, check=True)
 
     assert loaded.stdout.strip() == "set()"
+
+
+@pytest.mark.parametrize(
+    ("url", "variable"),
+    [
+        ("s3://scans/a", "AWS_SKIP_SIGNATURE"),
+        ("gs://scans/a", "GOOGLE_SKIP_SIGNATURE"),
+        ("az://scans/a", "AZURE_SKIP_SIGNATURE"),
+    ],
+)
+def test_refused_credentials_of_a_bucket_name_the_variables_of_its_cloud(url: str, variable: str) -> None:
+    with refused(UsageError, variable), foreign_errors(url):
+        raise PermissionError

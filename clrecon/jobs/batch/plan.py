@@ -306,9 +306,9 @@ def _read_table(path: str | Path) -> list[Case]:
                 places = _find_columns(name, next(table, []))
                 cases = _read_rows(name, ((table.line_num, row) for row in table), places, folder)
     except (UnicodeDecodeError, csv.Error) as error:
-        where = error if isinstance(error, csv.Error) else "it is no text in UTF-8"
+        reason = error if isinstance(error, csv.Error) else "it is no text in UTF-8"
         raise UsageError(
-            f"the manifest {name} is no table with commas or semicolons: {where}; save it as CSV in UTF-8"
+            f"the manifest {name} is no table with commas or semicolons: {reason}; save it as CSV in UTF-8"
         ) from None
     except OSError as error:
         raise UsageError(f"the manifest {name} cannot be read: {error.strerror or error}") from None

@@ -69,7 +69,7 @@ def open_zarr(path: Path, purpose: str) -> GridFile:
     warnings = [
         *([] if is_placed else [_UNPLACED]),
         *([f"the file has {len(images)} images: the first is read"] if len(images) > 1 else []),
-        *([f"{missing} of its files are missing: {array.fill_value} stands for their voxels"] if missing else []),
+        *([f"missing files: {missing:,}; {array.fill_value} stands for their voxels"] if missing else []),
     ]
     nk, nj, ni = (array.shape[axis] for axis in _list_spatial(axes))
     return GridFile(
@@ -113,7 +113,8 @@ def _telling(name: str, section: str) -> Iterator[None]:
     except Exception as error:
         fault = "needs more memory" if isinstance(error, MemoryError) else "is corrupt, or nothing that zarr reads,"
         reason = escape_text(f"{type(error).__name__}: {error}", 160)
-        raise RefusedInputError(f"{name} {fault} in {section} ({reason})") from error
+        advice = "" if isinstance(error, MemoryError) else ": get it again if it was cut"
+        raise RefusedInputError(f"{name} {fault} in {section} ({reason}){advice}") from error
 
 
 def _list_files(folder: Path, name: str) -> dict[Path, int]:

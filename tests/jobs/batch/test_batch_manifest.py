@@ -75,9 +75,8 @@ def test_manifest_that_is_no_text_or_missing_is_refused_with_its_name(content: b
 
 def test_manifest_in_utf_16_is_refused_with_the_encoding_to_save_it_in(tmp_path: Path) -> None:
     (tmp_path / "cohort.csv").write_text("case,input\na,x\n", encoding="utf-16")
-    with refused(UsageError, "cohort.csv", "UTF-8") as refusal:
+    with refused(UsageError, "cohort.csv", "save", "UTF-8"):
         read_cases(tmp_path / "cohort.csv", ScanSettings())
-    assert "codec" not in str(refusal.value)
 
 
 def test_unknown_format_of_meshes_is_refused_with_the_parameter_that_names_it() -> None:
