@@ -49,7 +49,7 @@ def _find_paragraphs(lines: list[str]) -> list[list[str]]:
     """Put lines together that are one text: broken because they were full, with the rest under the beginning."""
     paragraphs: list[list[str]] = []
     for line in lines:
-        if paragraphs and line.strip() and not _COMMAND.match(line) and not _has_label(line):
+        if paragraphs and line.strip() and not _COMMAND.match(line) and _hang_of(line) <= _indent_of(line):
             last = paragraphs[-1][-1]
             indent, hang = _indent_of(line), _hang_of(paragraphs[-1][0])
             was_full = len(last) + 1 + len(line.split()[0]) > FULL
@@ -66,11 +66,6 @@ def _fit_paragraph(lines: list[str], width: int) -> str:
     text = " ".join([lines[0].rstrip(), *(line.strip() for line in lines[1:])])
     hang = _hang_of(lines[0]) if _hang_of(lines[0]) <= width // 2 else _indent_of(lines[0])
     return "\n".join(_wrap(text, width, hang))
-
-
-def _has_label(line: str) -> bool:
-    """True for a row of a list: a word or a few, and its text after a gap."""
-    return _hang_of(line) > _indent_of(line)
 
 
 def _indent_of(line: str) -> int:

@@ -68,7 +68,9 @@ example:    clrecon mesh CT_FOLDER -o bone.stl
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command with these arguments, by default those of the process; return the exit code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
-    _escape_unencodable()
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")  # a folder with an umlaut is no error
     flags = arguments[: arguments.index("--")] if "--" in arguments else arguments
     console = Console(as_json="--json" in flags)
     debug = "--debug" in flags
@@ -136,13 +138,6 @@ def _as_help_option(arguments: list[str]) -> list[str]:
         return arguments
     words = [word for word in arguments[1:] if word != HELP]
     return [*words, "--help-all" if any(word in COMMANDS for word in words) else "--help"]
-
-
-def _escape_unencodable() -> None:
-    """Print characters that a stream's encoding lacks as escapes, so that a folder with an umlaut is not an error."""
-    for stream in (sys.stdout, sys.stderr):
-        if hasattr(stream, "reconfigure"):
-            stream.reconfigure(errors="backslashreplace")
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:

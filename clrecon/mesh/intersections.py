@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import chain
 from typing import Any
 
@@ -327,7 +328,7 @@ def _cut_pairs(left: Float64Array, right: Float64Array, same: NDArray[np.bool_])
     common = same.sum(axis=(0, 1))
     rows = np.flatnonzero(common == 0)
     is_cut[rows] = _meet(left[:, rows], right[:, rows])
-    for count, meet in ((1, _meet_beside_corner), (2, _fold)):
+    for count, meet in ((1, partial(_meet, edges=((1, 2),))), (2, _fold)):
         rows = np.flatnonzero(common == count)
         # First comes the common corner, or the one that is not common.
         first = [(same[:, :, rows].any(axis=axis) == (count == 1)).argmax(axis=0) for axis in (1, 0)]
@@ -360,11 +361,6 @@ def _meet(
             meets[rows[within]] |= _meet_in_plane(left[a][within], left[b][within], right[:, within])
         left, right = right, left
     return meets
-
-
-def _meet_beside_corner(left: Float64Array, right: Float64Array) -> NDArray[np.bool_]:
-    """True where triangles with a common first corner have another point in common."""
-    return _meet(left, right, ((1, 2),))
 
 
 def _fold(left: Float64Array, right: Float64Array) -> NDArray[np.bool_]:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import math
 import operator
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -266,6 +267,14 @@ def explains_arguments(function: Callable[Given, Made]) -> Callable[Given, Made]
             raise
 
     return call
+
+
+def number_or_nan(value: Any) -> float:
+    """Return `value` as a float, NaN if it is not a number or has no float."""
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
 
 
 def as_numbers(name: str, values: Any) -> NDArray[np.float64]:

@@ -29,12 +29,17 @@ def without_vtk(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def ct_without_vtk(without_vtk: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A CT in the folder ct of the working folder, where VTK cannot be imported."""
-    with pytest.raises(ModuleNotFoundError):
-        from vtkmodules import vtkCommonCore  # noqa: F401
+def small_ct(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A CT in the folder ct of the working folder."""
     monkeypatch.chdir(tmp_path)
     write_phantom(tmp_path / "ct", PhantomSettings(size=(80, 80), slices=30, spacing=(2.4, 2.4, 3.0)))
+
+
+@pytest.fixture
+def ct_without_vtk(small_ct: None, without_vtk: None) -> None:
+    """The same where VTK cannot be imported."""
+    with pytest.raises(ModuleNotFoundError):
+        from vtkmodules import vtkCommonCore  # noqa: F401
 
 
 @pytest.mark.usefixtures("ct_without_vtk")
@@ -87,11 +92,9 @@ def test_nearest_points_and_rays_of_a_mesh_are_found_without_vtk(device: Any) ->
 
 
 @pytest.fixture
-def ct_without_scipy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A CT in the folder ct of the working folder, where scipy cannot be imported."""
+def ct_without_scipy(small_ct: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same where scipy cannot be imported."""
     hide_packages(monkeypatch, "scipy", "skimage")
-    monkeypatch.chdir(tmp_path)
-    write_phantom(tmp_path / "ct", PhantomSettings(size=(80, 80), slices=30, spacing=(2.4, 2.4, 3.0)))
 
 
 @pytest.mark.usefixtures("ct_without_scipy")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from clrecon.errors import UsageError
 from clrecon.exchange.formats import check_cloud_format, check_format, describe_cloud_losses, stage_cloud, stage_mesh
 from clrecon.jobs.cloud.settings import OF_SCANS, CloudSettings
-from clrecon.jobs.cloud.steps import CloudSteps, find_ghosts, iso_value_of, name_reasons, take_points, try_steps
+from clrecon.jobs.cloud.steps import CloudSteps, find_ghosts, iso_value_of, take_points, try_steps
 from clrecon.jobs.inputs import describe_cloud, is_cloud_file, refuse_other_clouds, refuse_scan_settings
 from clrecon.jobs.preprocess import Band, mask_volume, preprocess_volume, restrict_volume
 from clrecon.jobs.run import Run, RunReport
@@ -251,7 +251,9 @@ def report_of(
         paper=settings.paper,
         steps=steps.entries,
         gates=[gate.as_dict() for gate in steps.gates],
-        removed_labels=name_reasons(steps.reasons) if any(file["what"] == "removed" for file in outputs) else None,
+        removed_labels=[{"label": number, "reason": reason} for number, reason in enumerate(("kept", *steps.reasons))]
+        if any(file["what"] == "removed" for file in outputs)
+        else None,
         surface=None if surface is None else _describe_surface(surface),
         outputs=outputs,
     )

@@ -285,8 +285,3 @@ class CloudSteps:
         cloud = self.first.changed(labels=self.fate.astype(np.int32))
         cloud.report = report
         return cloud
-
-
-def name_reasons(reasons: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the report's list of labels of the removed points."""
-    return [{"label": number, "reason": reason} for number, reason in enumerate(("kept", *reasons))]

@@ -150,7 +150,9 @@ def judge_label_volumes(parts: Sequence[Part], closed: bool) -> list[dict[str, A
     for surface, members in by_surface.items():
         origin = members[0].mesh.report
         by_hu = origin["surface"] == "hu"
-        label_ml = _ml_in_ct(origin) if by_hu else origin["label_ml"]
+        label_ml = float(origin["label_ml"])
+        if by_hu:  # of the voxels that lie in the CT; if no centre does, of the resampled voxels
+            label_ml = float(label_ml * origin["label_inside_share"] or origin["label_taken_ml"])
         mesh_ml = sum(enclosed_ml(part.mesh.vertices, part.mesh.triangles) for part in members) if closed else None
         advice = "" if mesh_ml is None else _advise(mesh_ml < label_ml, origin)
         gate = judge_label_volume(mesh_ml, label_ml, advice, by_hu=by_hu)
@@ -158,11 +160,6 @@ def judge_label_volumes(parts: Sequence[Part], closed: bool) -> list[dict[str, A
         for part in members:
             part.facts |= {"label_mesh_ml": mesh_ml, "label_compared_ml": label_ml}
     return gates
-
-
-def _ml_in_ct(origin: dict[str, Any]) -> float:
-    """Return the volume of the label's voxels that lie in the CT; if no centre does, that of the resampled voxels."""
-    return float(origin["label_ml"] * origin["label_inside_share"] or origin["label_taken_ml"])
 
 
 def _advise(too_small: bool, origin: dict[str, Any]) -> str:

@@ -260,7 +260,8 @@ class MeshSettings(options.SharedSettings):
             names = ("labels", "grow_from", "method", "vertex_rule", "surface")
             options.refuse_changed(self, names, options.describe_sharing(self.scheduler))
         if self.by_slabs:
-            self._check_by_slabs()
+            asked = name_parameter("by_slabs", True)
+            options.refuse_changed(self, _OF_WHOLE_MESHES, f"{asked} keeps no mesh in memory, which this needs")
         if self.iso_value is not None and self.preset is not None:
             raise UsageError("give either an iso value in HU or a preset, not both")
         self._check_masks()
@@ -302,10 +303,6 @@ class MeshSettings(options.SharedSettings):
             raise UsageError("labels take what lies from one iso value on, not below it")
         if self.labels_pick and self.topology != "separated":
             raise UsageError(f"the topology {self.topology} follows HU: leave it out with labels, which pick the cells")
-
-    def _check_by_slabs(self) -> None:
-        asked = name_parameter("by_slabs", True)
-        options.refuse_changed(self, _OF_WHOLE_MESHES, f"{asked} keeps no mesh in memory, which this needs")
 
     def _check_surface(self) -> None:
         """Refuse an unknown kind of surface, and `cortex` where HU do not place the outer surface of bone."""

@@ -82,13 +82,9 @@ def plan_surfaces(levels: Sequence[float | tuple[float, ...]], *, below: bool = 
 def _name_surface(level: float | tuple[float, ...], below: bool) -> str:
     """Name a surface for its files: ``200hu``, ``100to300hu``, ``below-400hu``."""
     numbers = level if isinstance(level, tuple) else (level,)
-    return f"{'below' if below else ''}{'to'.join(map(_digits, numbers))}hu"
-
-
-def _digits(value: float) -> str:
-    """Write a number for a file name with all its digits, so that different numbers never look the same."""
-    text = repr(float(value) + 0.0)  # + 0.0 turns -0 into 0
-    return text.removesuffix(".0")
+    # All digits, so that different numbers never look the same; + 0.0 turns -0 into 0.
+    digits = (repr(float(number) + 0.0).removesuffix(".0") for number in numbers)
+    return f"{'below' if below else ''}{'to'.join(digits)}hu"
 
 
 _HIGHEST_DRY_HU, _DRY_HU = -100, -200

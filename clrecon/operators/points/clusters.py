@@ -141,15 +141,9 @@ def cluster_points(
     if hu is None or volume is not None:
         raise UsageError(f"clusters of a volume need {name_parameter('hu', 'LO,HI')} and no other volume")
     with open_volume(cloud, device, memory, "a search for clusters") as resident:
-        return _cluster_volume(resident, checked_band(hu), eps, min_samples, tell)
-
-
-def _cluster_volume(
-    resident: DeviceVolume, band: tuple[float, float], eps: float | None, min_samples: int | str, tell: Progress
-) -> Clustering:
-    for attempt in resident.with_fallback():
-        with attempt as (_, notes):
-            clusters = _cluster_band(resident, band, eps, min_samples, notes, tell)
+        for attempt in resident.with_fallback():
+            with attempt as (_, notes):
+                clusters = _cluster_band(resident, checked_band(hu), eps, min_samples, notes, tell)
     return clusters
 
 

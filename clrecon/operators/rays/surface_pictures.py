@@ -101,7 +101,9 @@ class _Job(HollowedPicture):
         low_k, high_k = _field_heights(volume, self.frame, (slab.low_k, slab.high_k))
         last = [n - 1 for n in volume.shape_ijk]
         with self.stopwatch.running(device):  # wait: CPU devices read host arrays
-            leaps = _find_leaps(resident, slab, rule.iso_level)
+            leaps = find_leaps(
+                resident, slab, ("surface", rule.iso_level), np.array([False, True]), *_level_nodes(rule.iso_level)
+            )
             view = self._view(leaps)
             launch(
                 device, resident.program("rays/surface.cl", **variants)["trace_surface"], output.items(queues, lanes),
@@ -172,11 +174,6 @@ def _float4(*numbers: float) -> NDArray[np.float32]:
     vector = np.zeros(4, np.float32)
     vector[: len(numbers)] = numbers
     return vector
-
-
-def _find_leaps(resident: DeviceVolume, slab: RaySlab, level: float) -> LeapMap:
-    """Find the bricks that reach the level."""
-    return find_leaps(resident, slab, ("surface", level), np.array([False, True]), *_level_nodes(level))
 
 
 def _level_nodes(level: float) -> tuple[float, float]:

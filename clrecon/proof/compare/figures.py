@@ -337,8 +337,9 @@ class Figures:
     paper: dict[str, Any] | None = None
 
     def complete(self, records: Sequence[MethodRecord]) -> list[MethodRecord]:
+        size = self.views[self.reference].shape if self.reference in self.views else None
         likeness = compare_pictures(
-            {name: view for name, view in self.views.items() if self._is_like(name)}, self.reference
+            {name: view for name, view in self.views.items() if view.shape == size}, self.reference
         )
         return [
             record.changed(
@@ -348,10 +349,6 @@ class Figures:
             )
             for record in records
         ]
-
-    def _is_like(self, name: str) -> bool:
-        """True where the picture has the size of the reference's."""
-        return self.reference in self.views and self.views[name].shape == self.views[self.reference].shape
 
     def slice_entries(self) -> list[dict[str, Any]]:
         return [

@@ -212,13 +212,9 @@ def _check_openness(device: Device) -> str:
     return f"{len(TYPES)} x {grid.size:,} cells as open as computed"
 
 
+_OPENED = ("fill_cells", "sweep_light", "finish_openness")
 LEAP_CHECKS = (
-    Check(
-        "openness of places",
-        ("fill_cells", "sweep_light", "finish_openness"),
-        _check_openness,
-        {"rays/openness.cl": ("LABELS",)},
-    ),
+    Check("openness of places", _OPENED, _check_openness, {"rays/openness.cl": ("LABELS",)}),
     Check("smoothed light", ("smooth_along",), _check_smoothing),
     Check(
         "leaps of rays", ("measure_cells", "mark_bricks", "spread_in_rows", "spread_along", "look_ahead"), _check_leaps
@@ -437,7 +433,6 @@ def _check_points(device: Device) -> str:
     return f"2 pictures of {SIZE[0]} x {SIZE[1]} pixels within {worst:.1f} of 255"
 
 
-_OPENED = ("fill_cells", "sweep_light", "finish_openness")
 _PREPARED = ("measure_cells", "mark_bricks", "spread_in_rows", "spread_along")
 RENDERED = (*_PREPARED, "enter_tiles", "look_ahead", "composite_rays")
 _PROJECTED = ("measure_cells", "project_rays")

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
 
 from clrecon.errors import UsageError
+from clrecon.system.arguments import number_or_nan
 from clrecon.system.light_dataclass import dataclass
 
 LEAST_SOFT_GRADIENT = 0.01
@@ -15,10 +15,7 @@ LEAST_SOFT_GRADIENT = 0.01
 
 
 def _checked_share(name: str, value: Any, low: float, high: float) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError, OverflowError):
-        number = math.nan
+    number = number_or_nan(value)
     if not low <= number <= high:
         raise UsageError(f"the {name} of lighting lies between {low:g} and {high:g}, not at {value!r}")
     return number

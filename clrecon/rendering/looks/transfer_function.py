@@ -15,7 +15,7 @@ from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
 from clrecon.rendering.looks.lighting import Lighting
 from clrecon.rendering.looks.piecewise import check_ascending, check_share, evaluate_curve
-from clrecon.system.arguments import as_numbers, explains_arguments
+from clrecon.system.arguments import as_numbers, explains_arguments, number_or_nan
 from clrecon.system.base_classes import Message
 from clrecon.system.files import replace_file
 from clrecon.system.paths import keep_existing
@@ -89,10 +89,7 @@ class TransferFunction(Message):
     ):
         self._points = self._check_points(points)
         self._gradient_opacity = None if gradient_opacity is None else self._check_gradient(gradient_opacity)
-        try:
-            self._unit_distance = float(unit_distance)
-        except (TypeError, ValueError, OverflowError):
-            self._unit_distance = np.nan
+        self._unit_distance = number_or_nan(unit_distance)
         if not 1.0 / _UNIT_LIMIT_MM <= self._unit_distance <= _UNIT_LIMIT_MM:
             raise UsageError(
                 "the unit distance of a transfer function is a length in mm, above 0 and at most"

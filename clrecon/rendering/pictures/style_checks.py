@@ -13,6 +13,7 @@ from clrecon.rendering.looks.colors import find_color
 from clrecon.rendering.looks.presets import find_preset
 from clrecon.rendering.looks.transfer_function import TransferFunction
 from clrecon.rendering.views.centre_line import Curve
+from clrecon.system.arguments import number_or_nan
 
 SPINE = "spine"
 """Value of a curve that stands for the spinal canal, which is found in the volume."""
@@ -43,10 +44,7 @@ def number(text: str, is_fine: Callable[[float], bool]) -> Callable[[Any], float
     """Make a check of one number; the message is `text`, which describes it, and the given value."""
 
     def check_number(value: Any) -> float:
-        try:
-            checked = float(value)
-        except (TypeError, ValueError, OverflowError):
-            checked = math.nan
+        checked = number_or_nan(value)
         if not math.isnan(checked) and is_fine(checked):
             return checked
         shown = f"{value:g}" if isinstance(value, float) else f"{value!r:.60}"

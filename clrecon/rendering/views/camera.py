@@ -12,16 +12,8 @@ from numpy.typing import ArrayLike
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array, checked_points
 from clrecon.geometry.grid import Grid
-from clrecon.rendering.views.directions import (
-    DEFAULT_SIZE,
-    as_point,
-    checked_size,
-    checked_vector,
-    find_up,
-    find_view,
-    number_or_nan,
-)
-from clrecon.system.arguments import DirectionName, explains_arguments
+from clrecon.rendering.views.directions import DEFAULT_SIZE, as_point, checked_size, checked_vector, find_up, find_view
+from clrecon.system.arguments import DirectionName, explains_arguments, number_or_nan
 from clrecon.system.light_dataclass import dataclass, replace
 
 DEFAULT_VIEW_ANGLE = 30.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any, cast
 
@@ -29,14 +28,6 @@ DEFAULT_SIZE = (1024, 1024)
 
 LARGEST_SIDE = 16384
 """Largest number of pixels along a side of a picture; more is a typing error."""
-
-
-def number_or_nan(value: Any) -> float:
-    """Return `value` as a float, NaN if it is not a number or has no float."""
-    try:
-        return float(value)
-    except (TypeError, ValueError, OverflowError):
-        return math.nan
 
 
 def as_point(vector: Any) -> tuple[float, float, float]:

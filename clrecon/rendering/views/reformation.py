@@ -27,7 +27,8 @@ from clrecon.geometry.grid import Grid
 from clrecon.geometry.volume import Volume
 from clrecon.rendering.views.camera import Camera, box_corners
 from clrecon.rendering.views.centre_line import Curve, rotation_minimising_normals
-from clrecon.rendering.views.directions import DIRECTIONS, as_point, checked_size, number_or_nan
+from clrecon.rendering.views.directions import DIRECTIONS, as_point, checked_size
+from clrecon.system.arguments import number_or_nan
 from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.text import unknown_name
 

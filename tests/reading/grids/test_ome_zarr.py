@@ -208,23 +208,25 @@ def test_memory_that_is_too_small_for_a_layer_of_chunks_is_no_damage(tmp_path: P
         next(greedy.iterate_slices())
 
 
-def test_volume_larger_than_the_free_memory_is_mapped_from_a_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, np.ndarray]:
+    """A store and its voxels, of which half would fit the free memory."""
     voxels = make_ct(SHAPE)
-    path = write_ome_zarr(tmp_path / "a.zarr", voxels)
     monkeypatch.setattr(memory, "available_memory_bytes", lambda: voxels.nbytes / 2)
+    return write_ome_zarr(tmp_path / "a.zarr", voxels), voxels
+
+
+def test_volume_larger_than_the_free_memory_is_mapped_from_a_file(too_large: tuple[Path, np.ndarray]) -> None:
+    path, voxels = too_large
     volume = clrecon.read_volume(path)
     assert memory.find_mapping(volume.voxels) is not None
     assert np.array_equal(volume.voxels, voxels)
 
 
 def test_volume_larger_than_the_free_memory_and_disk_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    too_large: tuple[Path, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    voxels = make_ct(SHAPE)
-    path = write_ome_zarr(tmp_path / "a.zarr", voxels)
-    monkeypatch.setattr(memory, "available_memory_bytes", lambda: voxels.nbytes / 2)
+    path, voxels = too_large
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: shutil._ntuple_diskusage(1, 1, voxels.nbytes // 2))
     with refused(RefusedInputError, "a.zarr", "TMPDIR"):
         clrecon.read_volume(path)
