@@ -6,9 +6,9 @@
 
 `run` makes the phantom of `phantom_command`, the same with a tilted gantry, and runs each program on the phantom and
 the named folders in turn: once for its peak memory and its mesh, then `--rounds` times for seconds. PEERS is an
-environment with dicom2stl and meshlib; InVesalius is Debian's package `invesalius`, which needs `xvfb-run`. A program
-that is not there, or fails, is a row that says so. The figures are kept in docs/benchmarks/processes; `page` writes the
-tables into README.md and docs/benchmarks.md.
+environment with dicom2stl, meshlib, pydicom, scikit-image and trimesh; InVesalius is Debian's package `invesalius`,
+which needs `xvfb-run`. A program that is not there, or fails, is a row that says so. The figures are kept in
+docs/benchmarks/processes; `page` writes the tables into README.md and docs/benchmarks.md.
 """
 
 from __future__ import annotations
@@ -67,6 +67,8 @@ def programs(peers_python: str, threads: int) -> list[Program]:
                 note="one piece, smoothed, a tenth of the triangles, checked for cuts"),
         Program("simpleitk-vtk", "SimpleITK + VTK flying edges",
                 (sys.executable, str(HERE / "peers" / "simpleitk_vtk.py"), "IN", "OUT", hu, str(threads))),
+        Program("pydicom-skimage", "pydicom + scikit-image",
+                (peers_python, str(HERE / "peers" / "pydicom_skimage.py"), "IN", "OUT", hu), (peers_python,)),
         Program("meshlib", "MeshLib",
                 (peers_python, str(HERE / "peers" / "meshlib_mesh.py"), "IN", "OUT", hu, str(threads)),
                 (peers_python,)),
@@ -218,7 +220,8 @@ def run(options: argparse.Namespace) -> None:
 
 def _versions(peers_python: str) -> dict[str, str]:
     """Versions of the peers that are there."""
-    asked = "from importlib.metadata import version as v\nfor n in ('dicom2stl', 'meshlib'):\n print(n, v(n))"
+    names = ("dicom2stl", "meshlib", "scikit-image")
+    asked = f"from importlib.metadata import version as v\nfor n in {names}:\n print(n, v(n))"
     found = {}
     for command in ([peers_python, "-c", asked], ["dpkg-query", "-W", "-f", "${Package} ${Version}", "invesalius"]):
         try:
@@ -296,7 +299,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("run", "page"))
     parser.add_argument("inputs", nargs="*", metavar="NAME=CT_FOLDER")
-    parser.add_argument("--peers-python", default="python3", help="Python with dicom2stl and meshlib")
+    parser.add_argument("--peers-python", default="python3", help="Python with the packages of the peers")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--work", default=str(Path(tempfile.gettempdir()) / "clrecon-processes"))

@@ -76,6 +76,8 @@ def try_run(python: str, resolution: str, folder: Path) -> dict[str, Any]:
     started = time.monotonic()
     said = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True).stdout
     counts = {word.rstrip("s") if word == "errors" else word: int(number) for number, word in COUNT.findall(said)}
+    if not counts:  # pytest itself ended
+        counts["error"] = 1
     failed = [line.partition(" - ")[0] for line in said.splitlines() if line.startswith(("FAILED", "ERROR"))]
     seconds = round(time.monotonic() - started)
     return {
