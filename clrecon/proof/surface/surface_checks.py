@@ -332,8 +332,8 @@ LABEL_CHECKS = (
 PLACES = 700
 """Profiles that are sampled."""
 
-_WALLS = 4200
-"""Walls that are fitted: more than 500 vectors of eight."""
+_WALLS = 8200
+"""Walls that are fitted: more than 500 vectors of sixteen."""
 
 _VALUE_TOLERANCE_HU = 0.25
 """Places in float32, 2e-5 of a voxel off, where values change by 1000 HU within a voxel or two."""
