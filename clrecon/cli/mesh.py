@@ -196,7 +196,7 @@ def _describe_slabs(report: dict[str, Any]) -> str:
 def _describe_choice(report: dict[str, Any]) -> str:
     choice = report["iso_value_choice"]
     if choice is None:
-        if report["preset"] == "bone":
+        if report["preset"] == "bone" and not any((mesh["cortex"] or {}).get("moved") for mesh in report["meshes"]):
             return f"preset bone: {_describe_costs(report['volume'])}"
         return f"preset {report['preset']}" if report["preset"] else "as given"
     if choice["method"] != "auto":
@@ -253,7 +253,8 @@ def describe_cortex(meshes: list[dict[str, Any]]) -> list[str]:
     outside, error = cortex["outside_mm"], cortex["error_mm"]
     walls = cortex["thickness_mm"]
     share = 100.0 * cortex["fitted"] / cortex["vertices"]
-    ends = f"5 % to 95 %: {outside['p5']:+.2f} to {outside['p95']:+.2f}"
+    low, high = (-outside["p95"], -outside["p5"]) if cortex["moved"] else (outside["p5"], outside["p95"])
+    ends = f"5 % to 95 %: {low:+.2f} to {high:+.2f}, outward is positive"
     side = "outside" if (outside["mean"] < 0.0) == cortex["moved"] else "inside"
     if not cortex["moved"]:
         return [f"cortex   lies {abs(outside['mean']):.2f} mm {side} of the bone ({ends}), measured at {share:.0f} %"]

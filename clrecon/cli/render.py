@@ -38,7 +38,7 @@ from clrecon.jobs.view import ViewSettings
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.options import numbers_reader, option, options_of
 from clrecon.system.records import describe_volume
-from clrecon.system.text import count_of, to_hexadecimal
+from clrecon.system.text import count_of, to_hexadecimal, unknown_name
 
 _LABELS_LISTED = 24
 _PARTS = ("read", "mask", "render", "turntable", "write")
@@ -269,7 +269,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def render_settings(options: argparse.Namespace) -> RenderSettings:
-    named = options.color in (*POINT_COLORS, *MESH_COLORS)
+    values = (*POINT_COLORS, *MESH_COLORS)
+    named = options.color in values
+    word = str(options.color or "").lower().replace("grey", "gray")
+    if word.isalpha() and not named and word not in COLORS:
+        raise UsageError(f"{unknown_name('colour', options.color, (*COLORS, *values))}, or #rrggbb")
     look = "says how a label looks: give the label map with --labels FILE"
     turn = "says how a picture moves: name it with --turntable OUT"
     given = {name: getattr(options, name, None) for name in RenderSettings.keywords()} | {

@@ -74,6 +74,8 @@ def draw_arguments(chance: random.Random, folder: Path) -> list[str]:
         given += ["-o", str(folder / ("out" + chance.choice([".stl", ".ply", ".vtp", ".glb", ".obj", ".3mf", ".xyz"])))]
     if command == "render":
         given += ["-o", str(folder / "out.png"), "--size", "32x24"]
+    if command == "view":  # without a page to write it serves one until somebody ends it
+        given += [str(small_ct()), "--html", str(folder / "out.html")]
     if command == "cloud":
         given += ["-o", str(folder / ("out" + chance.choice([".ply", ".vtp", ".npz", ".xyz", ".las", ".stl"])))]
     return given + draw_options(command, chance, chance.randrange(1, 4))

@@ -237,13 +237,15 @@ def test_quality_of_a_mesh_is_printed_in_a_line(closed: bool, words: str) -> Non
 @pytest.mark.parametrize(
     ("moved", "mean", "words"),
     [
-        (True, 0.06, " 0.06 mm inside of the level"),
-        (True, -0.06, " 0.06 mm outside of the level"),
-        (False, 0.06, " 0.06 mm outside of the bone"),
-        (False, -0.06, " 0.06 mm inside of the bone"),
+        (True, 0.06, " 0.06 mm inside of the level (5 % to 95 %: -0.30 to +0.20, outward is positive)"),
+        (True, -0.06, " 0.06 mm outside of the level (5 % to 95 %: -0.30 to +0.20, outward is positive)"),
+        (False, 0.06, " 0.06 mm outside of the bone (5 % to 95 %: -0.20 to +0.30, outward is positive)"),
+        (False, -0.06, " 0.06 mm inside of the bone (5 % to 95 %: -0.20 to +0.30, outward is positive)"),
     ],
 )
-def test_side_of_a_fitted_surface_is_a_word_without_a_sign(moved: bool, mean: float, words: str) -> None:
+def test_side_of_a_fitted_surface_is_a_word_and_its_range_is_signed_outward(
+    moved: bool, mean: float, words: str
+) -> None:
     spread = {"p5": -0.2, "p50": 0.0, "p95": 0.3}
     cortex = {
         "moved": moved, "constants": {"blur_mm": 0.6}, "vertices": 200, "fitted": 100, "bias_mm": 0.05,

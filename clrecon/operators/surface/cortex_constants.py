@@ -30,6 +30,8 @@ from clrecon.system.pieces import spread_rows
 _FEWEST_WALLS = 60
 """Profiles across walls below which nothing is known of a scan's cortex."""
 
+HOW_TO_FIT = "start from an iso value of bone, such as 200 HU, or leave the surface at its iso value"
+
 MOST_WALLS, LOOKED_AT = 500, 4000
 """Profiles that the constants are measured in, and vertices among which they are searched."""
 
@@ -278,7 +280,7 @@ def _sample_walls(
     if len(walls) < _FEWEST_WALLS:
         raise NoSurfaceError(
             f"the surface has no walls of bone that the cortex could be measured in: {len(walls)} of"
-            f" {len(rows):,} profiles across it, at least {_FEWEST_WALLS} are needed"
+            f" {len(rows):,} profiles across it, at least {_FEWEST_WALLS} are needed; {HOW_TO_FIT}"
         )
     return values[:, walls[spread_rows(len(walls), MOST_WALLS)]]
 

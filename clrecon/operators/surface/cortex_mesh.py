@@ -31,7 +31,7 @@ from clrecon.operators.surface.cortex import (
     blurs_of,
     unexplained_hu,
 )
-from clrecon.operators.surface.cortex_constants import SOLID_SHARE, STEPPED, find_groups, measure_constants
+from clrecon.operators.surface.cortex_constants import HOW_TO_FIT, SOLID_SHARE, STEPPED, find_groups, measure_constants
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.pieces import chunks, in_threads, spread_rows
@@ -529,7 +529,7 @@ def _refuse_few(count: int, vertices: int) -> None:
     if count < _FEWEST_FITTED:
         raise NoSurfaceError(
             f"the surface has no walls of bone to be fitted: {count} of {vertices:,} vertices, at least"
-            f" {_FEWEST_FITTED} are needed"
+            f" {_FEWEST_FITTED} are needed; {HOW_TO_FIT}"
         )
 
 

@@ -118,6 +118,7 @@ def test_white_cloud_has_shades_of_grey_only_with_a_light(
         (["--iso", "300"], "--iso does not apply to mode points"),
         (["--shadows"], "--shadows does not apply to mode points"),
         (["--color", "hue"], "unknown colour 'hue'"),
+        (["--color", "labels"], "did you mean label?"),
         (["--point-radius", "0"], "the radius of points is a length in mm"),
         (["--color", "label", "--window", "0,9"], "--color hu"),
         (["--values", "v.npy"], "--values does not apply to mode points"),
