@@ -181,7 +181,12 @@ def test_labels_that_do_not_fit_together_have_the_same_surfaces_one_by_one(devic
 def test_labels_that_do_not_fit_together_upload_three_slabs_each(device, three_layers, monkeypatch):
     volume, labels = three_layers
     uploads, true_upload = [], device_volume.ocl.upload
-    monkeypatch.setattr(device_volume.ocl, "upload", lambda d, a: uploads.append(a.shape) or true_upload(d, a))
+
+    def upload(device, array, **named):
+        uploads.append(array.shape)
+        return true_upload(device, array, **named)
+
+    monkeypatch.setattr(device_volume.ocl, "upload", upload)
     extract_labels(volume, labels, 3, device=device, solid=True, memory=500_000)
     slabs = [shape for shape in uploads if len(shape) == 3 and shape[1:] == (40, 40)]
     assert len(slabs) == 3 * 3

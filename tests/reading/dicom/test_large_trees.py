@@ -259,7 +259,7 @@ def test_headers_of_a_plain_series_are_parsed_by_the_plain_parser_alone(
         answers.append(parse(*given))  # type: ignore[arg-type]
         return answers[-1]
 
-    monkeypatch.setattr("clrecon.reading.dicom.parse.elements.parse_plainly", watch)
+    monkeypatch.setattr("clrecon.reading.dicom.parse.plain.parse_plainly", watch)
     assert len(scan_path(tmp_path).slices) == plan.shape[0]
     assert len(answers) == plan.shape[0]
     assert None not in answers  # None leaves a header to the careful parser
