@@ -65,9 +65,28 @@ def check_triangles(mesh: Mesh) -> None:
         raise UsageError(f"a mesh of {mesh.triangle_count} triangles is too large to be refined, at most 715,827,882")
 
 
-def carry_on(mesh: Mesh, name: str, facts: dict[str, Any]) -> dict[str, Any]:
-    """Return the report of a mesh with one more entry in ``refinement``."""
-    return {**mesh.report, "refinement": {**mesh.report.get("refinement", {}), name: facts}}
+def carry_on(
+    mesh: Mesh, vertices: NDArray[np.floating], triangles: NDArray[np.uint32], name: str, facts: dict[str, Any]
+) -> Mesh:
+    """Return what a mesh has become, with one more entry in ``refinement`` and the values of the nearest vertices.
+
+    Errors grow by the way from these along their normals.
+    """
+    report = {**mesh.report, "refinement": {**mesh.report.get("refinement", {}), name: facts}}
+    refined = Mesh(vertices, triangles, vertex_normals(vertices, triangles), report)
+    rows: slice | IntArray = slice(None)
+    if triangles is mesh.triangles:
+        refined.face_values = dict(mesh.face_values)
+    elif mesh.values:
+        from scipy.spatial import cKDTree
+
+        rows = cKDTree(mesh.vertices).query(vertices, workers=-1)[1]
+    refined.values = {of_value: values[rows] for of_value, values in mesh.values.items()}
+    if (errors := refined.values.get("error_mm")) is not None:
+        normals = vertex_normals(mesh.vertices, mesh.triangles) if mesh.normals is None else mesh.normals
+        ways = ((vertices - mesh.vertices[rows]) * normals[rows]).sum(axis=1)
+        refined.values["error_mm"] = np.hypot(errors, ways).astype(errors.dtype)
+    return refined
 
 
 def decimate_mesh(
@@ -108,7 +127,7 @@ def decimate_mesh(
         "vertices_taken_back": taken_back,
         "topology": topology,
     }
-    return Mesh(vertices, triangles, vertex_normals(vertices, triangles), carry_on(mesh, "decimate", facts))
+    return carry_on(mesh, vertices, triangles, "decimate", facts)
 
 
 def _nearly(wanted: float) -> float:

@@ -18,7 +18,6 @@ from clrecon.mesh.connectivity import find_edges, find_used, label_components
 from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.refine.decimation import carry_on, check_share, check_triangles
 from clrecon.mesh.refine.topology import TopologyChange, compare_topology, measure_topology
-from clrecon.mesh.triangles import vertex_normals
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.pieces import local_origin
 from clrecon.system.progress import Progress, ignore_progress
@@ -94,11 +93,11 @@ def collapse_quadric(mesh: Mesh, fraction: float, *, progress: Progress | None =
         "gates": gates,
     }
     progress("decimate", 3, 3)
-    report = carry_on(mesh, "quadric", facts)
+    refined = carry_on(mesh, vertices, triangles, "quadric", facts)
     failed = [gate.text for gate in gates if not gate.ok]
     if failed:
-        report["warnings"] = [*report.get("warnings", []), *failed]
-    return Mesh(vertices, triangles, vertex_normals(vertices, triangles), report)
+        refined.report["warnings"] = [*refined.report.get("warnings", []), *failed]
+    return refined
 
 
 def last_of_collapses(collapses: NDArray[np.integer], count: int) -> NDArray[np.int64]:

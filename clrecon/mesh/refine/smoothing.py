@@ -20,7 +20,7 @@ from clrecon.mesh.connectivity import label_components, order_by_number
 from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.refine.decimation import carry_on, check_refinement
 from clrecon.mesh.refine.shifts import Follow, follow_none, move_vertices
-from clrecon.mesh.triangles import cross_product, vertex_normals
+from clrecon.mesh.triangles import cross_product
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.pieces import in_threads, local_origin
 from clrecon.system.progress import Progress, ignore_progress
@@ -371,4 +371,4 @@ def smooth_mesh(
         "vertices_taken_back": taken_back,
         "components_left": left,
     }
-    return Mesh(vertices, mesh.triangles, vertex_normals(vertices, mesh.triangles), carry_on(mesh, "smooth", facts))
+    return carry_on(mesh, vertices, mesh.triangles, "smooth", facts)
