@@ -86,7 +86,7 @@ def test_batch_whose_scheduler_goes_away_ends_with_9_and_resumes_without_one(
     wait_until(scheduler, (folder / "s.json").exists)
     dask("worker", "--nthreads", "1", "--no-nanny")
     address = json.loads((folder / "s.json").read_text())["address"]
-    process = start_batch(folder, "--scheduler", address)
+    process = start_batch(folder, "--scheduler", address, DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT="2s")
     wait_until(process, (folder / "out" / CASES[0]).exists)
     scheduler.kill()
     _, errors = process.communicate(timeout=240)
