@@ -15,7 +15,7 @@ from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface import cortex
 from clrecon.operators.surface.cortex import CortexConstants, ProfileSampler, ProfileScale, StackFrame, WallFits
 from clrecon.operators.surface.cortex_constants import MOST_WALLS
-from clrecon.operators.surface.cortex_mesh import (
+from clrecon.operators.surface.cortex_fit import (
     _STATES,
     FITTED,
     METAL,
@@ -23,9 +23,9 @@ from clrecon.operators.surface.cortex_mesh import (
     NOT_BONE,
     fit_walls,
     judge_walls,
-    measure_bone_walls,
     standard_errors,
 )
+from clrecon.operators.surface.cortex_mesh import measure_bone_walls
 from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.proof.checking import OBLIQUE, stack
 from clrecon.proof.surface.surface_checks import CORTEX_CHECKS

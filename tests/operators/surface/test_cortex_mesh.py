@@ -22,17 +22,8 @@ from clrecon.opencl import Stopwatch
 from clrecon.opencl.launching import launch
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface import cortex, decimation
-from clrecon.operators.surface.cortex_mesh import (
-    _BADLY_FITTED,
-    FITTED,
-    NOT_BONE,
-    CortexFit,
-    calm_vertices,
-    choose_shifts,
-    doubt_lone_vertices,
-    find_turned,
-    fit_walls,
-)
+from clrecon.operators.surface.cortex_fit import BADLY_FITTED, FITTED, NOT_BONE, CortexFit, fit_walls
+from clrecon.operators.surface.cortex_mesh import calm_vertices, choose_shifts, doubt_lone_vertices, find_turned
 from clrecon.operators.surface.extract import extract_isosurface
 
 RADIUS = 13.0  # of the outer surface of the shell, mm
@@ -148,7 +139,7 @@ def test_vertex_without_bone_follows_its_wall_only_where_most_around_it_are_fitt
     doubt_lone_vertices(fit, triangles, fans)
 
     within = slice(1, 8)  # whose neighbours are all there
-    assert np.argwhere(fit.states.reshape(9, 9)[within] == _BADLY_FITTED).tolist() == [[3, 2]]
+    assert np.argwhere(fit.states.reshape(9, 9)[within] == BADLY_FITTED).tolist() == [[3, 2]]
     shifts = choose_shifts(fit, triangles, fans).reshape(9, 9)[within]
     np.testing.assert_allclose(shifts, np.where(np.arange(9) < 6, -0.5, 0.0) + np.zeros((7, 1)), rtol=1e-6)  # float32
 
@@ -160,7 +151,7 @@ def test_hidden_walls_follow_their_fitted_neighbours_three_vertices_far_and_othe
     is_fitted = (columns < 3).ravel()
     unused = np.full(81, np.nan, np.float32)
     fit = CortexFit(
-        constants=None, own_cortex_hu=(), states=np.where(is_fitted, FITTED, _BADLY_FITTED).astype(np.uint8),
+        constants=None, own_cortex_hu=(), states=np.where(is_fitted, FITTED, BADLY_FITTED).astype(np.uint8),
         hidden=~is_fitted & (rows < 5).ravel(), shift_mm=np.where(is_fitted, -0.5, 9.0).astype(np.float32),
         spread_mm=np.full(81, 0.1, np.float32),
         **dict.fromkeys(("thickness_mm", "error_mm", "room_mm"), unused),
