@@ -11,7 +11,7 @@ from clrecon.cli.console import Console, printable
 from clrecon.jobs.cloud.settings import STEPS, CloudSettings, Clustering
 from clrecon.jobs.inputs import CLOUD_INPUTS
 from clrecon.system.records import describe_volume
-from clrecon.system.text import count_of, format_band
+from clrecon.system.text import count_of, format_band, format_bytes
 
 _EXAMPLES = """\
 examples:
@@ -71,7 +71,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     report = make_cloud(options.input, files, settings, no_clobber=options.no_clobber, progress=console.progress)
     paths, space = {"cloud": options.output, "removed": options.removed, "surface": options.surface}, report["space"]
     written = [
-        f"wrote    {printable(paths[entry['what']])}, {common.megabytes(entry['bytes'])}, {space.upper()} mm"
+        f"wrote    {printable(paths[entry['what']])}, {format_bytes(entry['bytes'])}, {space.upper()} mm"
         for entry in report["outputs"]
     ]
     common.show_report(report, describe_cloud_job(report) + written, options, console)

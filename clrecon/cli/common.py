@@ -20,7 +20,7 @@ from clrecon.system.options import option_beside, options_of
 from clrecon.system.packages import missing_package
 from clrecon.system.processes import has_hung_device
 from clrecon.system.progress import DEFAULT_SECONDS, check_time_limit
-from clrecon.system.text import guess_word
+from clrecon.system.text import format_bytes, guess_word
 
 _INTERRUPTED = 130
 
@@ -293,7 +293,7 @@ def add_store(container: argparse._ActionsContainer, result: str, form: str) -> 
 def describe_stored(report: Any) -> list[str]:
     """Say what an archive has got; nothing where it was not asked."""
     stored = report.get("stored")
-    return [] if stored is None else [f"stored   {megabytes(stored['bytes'])}, with the name of the patient"]
+    return [] if stored is None else [f"stored   {format_bytes(stored['bytes'])}, with the name of the patient"]
 
 
 def add_no_clobber(container: argparse._ActionsContainer, *, with_ids: bool = True) -> None:
@@ -455,11 +455,3 @@ def describe_times(seconds: Mapping[str, float], parts: Iterable[str] = ()) -> s
     """Describe the seconds of a job for people, those of the parts that can be felt in brackets."""
     shown = [part for part in parts or seconds if part != "total" and seconds.get(part, 0.0) >= 0.005]
     return f"{seconds['total']:.2f} s ({', '.join(f'{part} {seconds[part]:.2f}' for part in shown)})"
-
-
-def megabytes(size: int) -> str:
-    """Format a number of bytes for people: ``12.3 MB`` (1 MB = 10^6 bytes)."""
-    for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
-        if size >= factor:
-            return f"{size / factor:.1f} {unit}"
-    return f"{size} bytes"

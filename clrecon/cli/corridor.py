@@ -12,6 +12,7 @@ from clrecon.errors import PARTLY_DONE
 from clrecon.jobs.outputs import MESH_FILES, MeshFiles, name_outputs
 from clrecon.jobs.settings import CorridorSettings
 from clrecon.system.records import describe_volume
+from clrecon.system.text import format_bytes
 
 _EPILOG = """\
 For each side of a vertebra: the straight line whose least distance to the outside of the solid bone is largest, from
@@ -65,7 +66,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         progress=console.progress,
     )
     files = _name_files(report, options.output, options.picture)
-    written = [f"wrote    {printable(path)}, {common.megabytes(size)}" for path, size in files]
+    written = [f"wrote    {printable(path)}, {format_bytes(size)}" for path, size in files]
     common.show_report(report, describe_report(report) + written, options, console)
     refused = [side for side in chain(*(each["corridors"] for each in report["vertebrae"])) if side["refused"]]
     return PARTLY_DONE if refused else 0

@@ -7,6 +7,7 @@ from typing import Any
 
 from clrecon.cli import common
 from clrecon.cli.console import Console, printable
+from clrecon.system.text import format_bytes
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,7 +39,7 @@ def _describe_survey(survey: dict[str, Any]) -> list[str]:
         mark = "*" if device["chosen"] else " "
         kind = "simulator" if device["simulator"] else device["type"]
         ownership = " of its own" if device["has_own_memory"] else ""
-        memory, largest = (common.megabytes(device[name]) for name in ("memory_bytes", "max_allocation_bytes"))
+        memory, largest = (format_bytes(device[name]) for name in ("memory_bytes", "max_allocation_bytes"))
         lines.append(f"{mark} {device['index']}  {kind:<11}  {printable(device['name'])}")
         lines.append(f"{'':18}{device['compute_units']} compute units, {memory}{ownership}, largest buffer {largest}")
         driver = f"{device['platform']}, {device['version']}, driver {device['driver']}"

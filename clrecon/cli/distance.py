@@ -9,7 +9,7 @@ from clrecon.cli import common
 from clrecon.cli.console import Console, printable
 from clrecon.jobs.inputs import MESH_INPUTS
 from clrecon.jobs.settings import DistanceSettings
-from clrecon.system.text import format_volume
+from clrecon.system.text import format_bytes, format_volume
 
 _EPILOG = """\
 Distances are measured from points spread evenly over each mesh to the nearest triangle of the other, in mm. If
@@ -82,7 +82,7 @@ def _describe_distance(report: dict[str, Any]) -> list[str]:
         )
     lines.append(f"time     {report['seconds']['total']:.2f} s")
     for output in report["outputs"]:
-        lines.append(f"wrote    {output['kind']} {printable(output['name'])}, {common.megabytes(output['bytes'])}")
+        lines.append(f"wrote    {output['kind']} {printable(output['name'])}, {format_bytes(output['bytes'])}")
     return lines
 
 

@@ -9,6 +9,7 @@ from clrecon.cli import common
 from clrecon.cli.console import Console, printable
 from clrecon.jobs.settings import ExportSettings
 from clrecon.system.records import describe_volume
+from clrecon.system.text import format_bytes
 
 _PARTS = ("read", "mask", "resample", "write")
 _EPILOG = """\
@@ -51,7 +52,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         progress=console.progress,
     )
     output = report["output"]
-    size, space = common.megabytes(output["bytes"]), output["space"].upper()
+    size, space = format_bytes(output["bytes"]), output["space"].upper()
     written = f"wrote    {printable(options.output)}, {size}, HU as {output['type']}, {space} mm"
     common.show_report(report, [*_describe_export(report), written], options, console)
     return 0

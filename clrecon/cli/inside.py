@@ -11,7 +11,7 @@ from clrecon.cli.console import Console, printable
 from clrecon.jobs.outputs import MESH_FILES, name_outputs
 from clrecon.jobs.settings import InsideSettings
 from clrecon.system.records import describe_volume
-from clrecon.system.text import format_volume
+from clrecon.system.text import format_bytes, format_volume
 
 _EPILOG = """\
 parts, each a separate mesh:
@@ -63,7 +63,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         progress=console.progress,
     )
     files = list(chain(*(vertebra["meshes"] for vertebra in report["vertebrae"])))
-    size = common.megabytes(sum(mesh["bytes"] for mesh in files))
+    size = format_bytes(sum(mesh["bytes"] for mesh in files))
     space = common.describe_space(options.output, report["space"])
     written = [f"wrote    {_name_files(options.output, report, 'meshes')}, {size}, {space}"]
     if options.picture:

@@ -15,7 +15,7 @@ from clrecon.jobs.mesh.surfaces import VALUE_GATES, names_level
 from clrecon.jobs.outputs import MESH_FILES, name_outputs
 from clrecon.jobs.presets import PRESETS
 from clrecon.system.records import describe_volume
-from clrecon.system.text import count_of, format_digits, format_ml, format_volume
+from clrecon.system.text import count_of, format_bytes, format_digits, format_ml, format_volume
 
 _PARTS = (
     *("device", "read", "mask", "choose", "solid", "upload", "build", "kernels", "download"),
@@ -190,7 +190,7 @@ def _describe_inside(low: float | None, high: float | None) -> str:
 def _describe_slabs(report: dict[str, Any]) -> str:
     if report["slabs"] == 1:
         return ""
-    return f", {report['slabs']} slabs of at most {common.megabytes(sum(report['device_bytes'].values()))}"
+    return f", {report['slabs']} slabs of at most {format_bytes(sum(report['device_bytes'].values()))}"
 
 
 def _describe_choice(report: dict[str, Any]) -> str:
@@ -231,7 +231,7 @@ def _describe_files(output: str, report: dict[str, Any], *, together: bool) -> s
     paths = [output] if together else name_outputs(output, [mesh["name"] or "" for mesh in report["meshes"]])
     names = [printable(str(path)) for path in (paths[0], paths[-1])]
     files = {1: names[0], 2: " and ".join(names)}.get(len(paths), f"{names[0]} to {names[1]}, {len(paths):,} files")
-    return f"{files}, {common.megabytes(report['output']['bytes'])}, {common.describe_space(output, report['space'])}"
+    return f"{files}, {format_bytes(report['output']['bytes'])}, {common.describe_space(output, report['space'])}"
 
 
 def _describe_quality(report: dict[str, Any]) -> list[str]:

@@ -38,7 +38,7 @@ from clrecon.jobs.view import ViewSettings
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.options import numbers_reader, option, options_of
 from clrecon.system.records import describe_volume
-from clrecon.system.text import count_of, to_hexadecimal, unknown_name
+from clrecon.system.text import count_of, format_bytes, to_hexadecimal, unknown_name
 
 _LABELS_LISTED = 24
 _PARTS = ("read", "mask", "render", "turntable", "write")
@@ -309,9 +309,9 @@ def run(options: argparse.Namespace, console: Console) -> int:
         for picture in report["pictures"]:
             if path is not None and entry in picture:
                 named = path_of(path, picture["name"] or "")
-                lines.append(f"wrote    {printable(named)}, {common.megabytes(picture[entry]['bytes'])}")
+                lines.append(f"wrote    {printable(named)}, {format_bytes(picture[entry]['bytes'])}")
     if report["turntable"]:
-        size = common.megabytes(report["turntable"]["output"]["bytes"])
+        size = format_bytes(report["turntable"]["output"]["bytes"])
         lines.append(f"wrote    {printable(files.turntable)}, {size}")
     common.show_report(report, describe_report(report) + lines, options, console)
     return 0

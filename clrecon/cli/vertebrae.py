@@ -9,7 +9,7 @@ from clrecon.cli import common
 from clrecon.cli.console import Console, printable
 from clrecon.jobs.settings import VertebraeSettings
 from clrecon.system.records import describe_volume
-from clrecon.system.text import count_of
+from clrecon.system.text import count_of, format_bytes
 
 _PARTLY = 8
 _NAMING = "numbers, counted from the head: name the levels with --first T1 or --name-at X,Y,Z=L3"
@@ -60,7 +60,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     lines = _describe_split(report)
     if settings.name_at is None and settings.first is None:
         lines.append(f"names    {_NAMING}")
-    lines.append(f"wrote    {printable(options.output)}, {common.megabytes(report['output']['bytes'])}")
+    lines.append(f"wrote    {printable(options.output)}, {format_bytes(report['output']['bytes'])}")
     lines += common.describe_stored(report)
     if with_picture:
         lines.append(f"picture  {printable(options.picture or picture_beside(options.output))}: look at it")

@@ -14,7 +14,7 @@ from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.options import size_option, space_option
 from clrecon.jobs.view import ViewSettings
 from clrecon.system.records import describe_volume, name_schema
-from clrecon.system.text import format_volume
+from clrecon.system.text import format_bytes, format_volume
 
 _EPILOG = """\
 Without --html and --window the inputs are shown in a browser of this computer and drawn on the OpenCL device: a slider
@@ -224,7 +224,7 @@ def _describe_view(report: dict[str, Any], output: str) -> list[str]:
         lines.append(f"         and {len(report['parts']) - _SHOWN_PARTS:,} more")
     if report["device"]:
         lines.append(f"device   {printable(report['device'])}")
-    size = f"{common.megabytes(report['output']['bytes'])}, vertices moved by at most {report['half_step_mm']:.2g} mm"
+    size = f"{format_bytes(report['output']['bytes'])}, vertices moved by at most {report['half_step_mm']:.2g} mm"
     return [*lines, f"wrote    {printable(output)}, {size}", f"time     {report['seconds']['total']:.2f} s"]
 
 

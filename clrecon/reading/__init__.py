@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from clrecon.errors import RefusedInputError, UsageError
-from clrecon.reading.common.selection import Selection, check_rescale
+from clrecon.reading.common.selection import Selection, check_rescale, check_voxel_size
 from clrecon.reading.sources import Source, opened
-from clrecon.system.arguments import explains_arguments
+from clrecon.system.arguments import explains_arguments, name_parameter
 from clrecon.system.progress import ignore_progress
 from clrecon.system.text import escape_text
 
@@ -29,34 +29,34 @@ _ZARR_METADATA = ("zarr.json", ".zgroup", ".zarray", ".zattrs")
 
 def read_selected(path: Source, selection: Selection, *, progress: Progress | None = None) -> Volume:
     """Read the part of an input that a selection names, see `read_volume`."""
-    rescale = check_rescale(selection.rescale)
+    rescale, voxel_size = check_rescale(selection.rescale), check_voxel_size(selection.voxel_size)
     with opened(path, progress or ignore_progress) as inside:
         kind = tell_format(inside)
+        _refuse_options(kind, selection)
         if kind is None:
             from clrecon.reading.dicom.reader import read_series
 
             return read_series(inside, selection, progress)
-        _refuse_options(kind, selection)
         from clrecon.reading.grids import read_grid
 
-        return read_grid(Path(inside), kind, rescale=rescale, progress=progress)
+        return read_grid(Path(inside), kind, rescale=rescale, voxel_size=voxel_size, progress=progress)
 
 
 def list_selected(
     path: Source, selection: Selection, *, pixels: bool = False, progress: Progress | None = None
 ) -> SeriesListing:
     """List an input, with the certificate of the part that a selection names, see `list_series`."""
-    rescale = check_rescale(selection.rescale)
+    rescale, voxel_size = check_rescale(selection.rescale), check_voxel_size(selection.voxel_size)
     with opened(path, progress or ignore_progress) as inside:
         kind = tell_format(inside)
+        _refuse_options(kind, selection)
         if kind is None:
             from clrecon.reading.dicom.reader import list_scan
 
             return list_scan(inside, selection, pixels=pixels, progress=progress)
-        _refuse_options(kind, selection)
         from clrecon.reading.grids import list_grid
 
-        return list_grid(Path(inside), kind, rescale=rescale, pixels=pixels, progress=progress)
+        return list_grid(Path(inside), kind, rescale=rescale, voxel_size=voxel_size, pixels=pixels, progress=progress)
 
 
 @explains_arguments
@@ -69,6 +69,7 @@ def read_volume(
     force: bool = False,
     follow_links: bool = False,
     rescale: tuple[float, float] | None = None,
+    voxel_size: tuple[float, float, float] | None = None,
     progress: Progress | None = None,
 ) -> Volume:
     """Read a volume in HU and LPS mm, from DICOM, NIfTI, NRRD, MetaImage or OME-Zarr.
@@ -99,6 +100,9 @@ def read_volume(
     rescale : (slope, intercept), optional
         Values are ``slope * stored + intercept``, regardless of the files: where a header lacks the rescale, is wrong
         about it, or a scanner has a scale of its own.  The certificate says that it was given.
+    voxel_size : (i, j, k), optional
+        mm between voxels, i along the last axis of the array: for Zarr whose metadata lack a scale or a unit, and for a
+        Zarr array without metadata.
     progress : callable, optional
         Called as ``progress(stage, done, total)`` with stage "scan" or "read", or "no answer yet from NAME" where the
         disk hangs.
@@ -124,8 +128,9 @@ def read_volume(
         The server of a URL does not answer, or fails.
     """
     chosen = Selection(
-        series=series, phase=phase, allow_gaps=allow_gaps, force=force, follow_links=follow_links, rescale=rescale
-    )
+        series=series, phase=phase, allow_gaps=allow_gaps, force=force, follow_links=follow_links, rescale=rescale,
+        voxel_size=voxel_size,
+    )  # fmt: skip
     return read_selected(path, chosen, progress=progress)
 
 
@@ -139,6 +144,7 @@ def list_series(
     force: bool = False,
     follow_links: bool = False,
     rescale: tuple[float, float] | None = None,
+    voxel_size: tuple[float, float, float] | None = None,
     pixels: bool = False,
     progress: Progress | None = None,
 ) -> SeriesListing:
@@ -146,7 +152,7 @@ def list_series(
 
     Parameters
     ----------
-    path, series, phase, allow_gaps, force, follow_links, rescale, progress
+    path, series, phase, allow_gaps, force, follow_links, rescale, voxel_size, progress
         As in `read_volume`.
     pixels : bool
         True: also read the voxels, for entries that depend on them.  False: read only headers.
@@ -165,16 +171,24 @@ def list_series(
         As in `read_volume`.
     """
     chosen = Selection(
-        series=series, phase=phase, allow_gaps=allow_gaps, force=force, follow_links=follow_links, rescale=rescale
-    )
+        series=series, phase=phase, allow_gaps=allow_gaps, force=force, follow_links=follow_links, rescale=rescale,
+        voxel_size=voxel_size,
+    )  # fmt: skip
     return list_selected(path, chosen, pixels=pixels, progress=progress)
 
 
-def _refuse_options(kind: str, selection: Selection) -> None:
-    """Refuse what only DICOM has: all but the rescale."""
-    options = {field.name: getattr(selection, field.name) for field in fields(Selection) if field.name != "rescale"}
-    given = [name for name, value in options.items() if value is not None and value is not False]
-    if given:
+def _refuse_options(kind: str | None, selection: Selection) -> None:
+    """Refuse what only DICOM has, all but the rescale, or only Zarr, the size of a voxel."""
+    if selection.voxel_size is not None and kind != "OME-Zarr":
+        name = name_parameter("voxel_size", "I,J,K")
+        raise UsageError(f"{name} is for Zarr, and files of other formats say how far apart voxels are: leave it out")
+    options = {field.name: getattr(selection, field.name) for field in fields(Selection)}
+    given = [
+        name
+        for name, value in options.items()
+        if name not in ("rescale", "voxel_size") and value is not None and value is not False
+    ]
+    if kind is not None and given:
         raise UsageError(f"{' and '.join(given)}: only for DICOM, and the input is {kind}")
 
 

@@ -13,7 +13,7 @@ from typing import IO, Any, NamedTuple
 from clrecon.errors import ClreconError, RefusedInputError, UsageError
 from clrecon.system.paths import open_regular
 from clrecon.system.progress import Progress
-from clrecon.system.text import escape_text
+from clrecon.system.text import escape_text, format_bytes
 
 PASSWORD_VARIABLE = "CLRECON_ARCHIVE_PASSWORD"
 """Of the environment: the password of encrypted archives; the command line is seen by others."""
@@ -169,7 +169,7 @@ class _Unpacking:
             raise RefusedInputError(f"{self._name} holds more than {self._limits.entries:,} files")
         if self._bytes > self._allowed:
             raise RefusedInputError(
-                f"{self._name} becomes more than {self._bytes / 1e9:.1f} GB, over {self._limits.ratio:g} times its"
+                f"{self._name} becomes more than {format_bytes(self._bytes)}, over {self._limits.ratio:g} times its"
                 " size: no scan packs like that; unpack it yourself if you trust it"
             )
         return entry
@@ -180,8 +180,8 @@ class _Unpacking:
         free = disk_usage(self._folder).free
         if wanted > free:
             raise RefusedInputError(
-                f"{self._name} takes {wanted / 1e9:.1f} GB unpacked, and the folder for temporary files has"
-                f" {free / 1e9:.1f} GB: name another with TMPDIR"
+                f"{self._name} takes {format_bytes(wanted)} unpacked, and the folder for temporary files has"
+                f" {format_bytes(free)}: name another with TMPDIR"
             )
 
 

@@ -13,7 +13,7 @@ from urllib.parse import SplitResult, quote, urlsplit
 
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.reading.archives import Limits
-from clrecon.system.text import escape_text
+from clrecon.system.text import escape_text, format_bytes
 
 DICOMWEB = ("dicomweb+https", "dicomweb+http")
 WEB = ("https", "http")
@@ -116,15 +116,14 @@ class Room:
     def on_disk(cls, name: str, folder: Path, limits: Limits) -> Room:
         """Return the room of a folder: most of its disk, up to the limit."""
         free = disk_usage(folder).free
-        advice = (
-            f"the folder for temporary files has {free / 1e9:.1f} GB: name another with TMPDIR, or download it yourself"
-        )
+        folder_has = f"the folder for temporary files has {format_bytes(free)}"
+        advice = f"{folder_has}: name another with TMPDIR, or download it yourself"
         return cls(name, min(limits.fetched_bytes, int(_SHARE_OF_DISK * free)), advice)
 
     def check(self, wanted: int) -> None:
         """Refuse so many bytes more than have arrived."""
         if self._taken + wanted > self._allowed:
-            raise RefusedInputError(f"{self._name} sends more than {self._allowed / 1e6:,.0f} MB: {self._advice}")
+            raise RefusedInputError(f"{self._name} sends more than {format_bytes(self._allowed)}: {self._advice}")
 
     def take(self, count: int) -> None:
         self.check(count)

@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, BinaryIO, Protocol
 
 from clrecon.errors import OutputError, UsageError
 from clrecon.system import paths
+from clrecon.system.text import format_bytes
 
 if TYPE_CHECKING:
     import logging
@@ -178,8 +179,8 @@ def _check_space(path: str | os.PathLike[str], folder: Path, expected_bytes: int
     # Some network file systems do not tell their free space and report 0 bytes.
     if usage.total and expected_bytes > usage.free:
         raise OutputError(
-            f"cannot write {paths.shown_path(path)}: it needs about {expected_bytes / 1e6:.1f} MB and "
-            f"{usage.free / 1e6:.1f} MB are free in {paths.shown_path(folder)}"
+            f"cannot write {paths.shown_path(path)}: it needs about {format_bytes(expected_bytes)} and "
+            f"{format_bytes(usage.free)} are free in {paths.shown_path(folder)}"
         ) from OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 

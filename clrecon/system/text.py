@@ -49,6 +49,14 @@ def count_of(number: int, noun: str, several: str | None = None) -> str:
     return f"{number:,} {noun if number == 1 else several or noun + 's'}"
 
 
+def format_bytes(size: float) -> str:
+    """Format a number of bytes for people: ``12.3 MB`` (1 MB = 10^6 bytes)."""
+    for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if size >= factor:
+            return f"{size / factor:,.1f} {unit}"
+    return f"{size:.0f} bytes"
+
+
 def format_digits(value: float, digits: int = 3) -> str:
     """Return a number with so many significant digits, never an exponent: ``12,346`` whole, ``0.0039``, ``-312``."""
     if value == 0.0:

@@ -10,9 +10,10 @@ import sys
 import pytest
 from printed_text import Printer
 
-from clrecon.cli.common import guard, megabytes, table
+from clrecon.cli.common import guard, table
 from clrecon.cli.console import Console, printable
 from clrecon.errors import DeviceError, NoDicomError
+from clrecon.system.text import format_bytes
 
 
 class Terminal(io.StringIO):
@@ -219,4 +220,4 @@ def test_columns_of_a_table_are_aligned_left_or_right() -> None:
     ("size", "shown"), [(12, "12 bytes"), (2500, "2.5 kB"), (7_340_000, "7.3 MB"), (4 * 10**9, "4.0 GB")]
 )
 def test_sizes_are_shown_in_bytes_kb_mb_and_gb(size: int, shown: str) -> None:
-    assert megabytes(size) == shown
+    assert format_bytes(size) == shown

@@ -142,8 +142,8 @@ def test_file_that_fills_the_disk_to_its_last_byte_is_accepted(tmp_path: Path, f
     files.check_writable(tmp_path / "a.ply", expected_bytes=free_bytes)
 
 
-def test_file_larger_than_the_free_space_is_refused_with_the_free_megabytes(tmp_path: Path, free_bytes: int) -> None:
-    with refused(OutputError, "MB", free_bytes / 10**6):
+def test_file_larger_than_the_free_space_is_refused_with_the_free_gigabytes(tmp_path: Path, free_bytes: int) -> None:
+    with refused(OutputError, "GB", free_bytes / 10**9):
         files.check_writable(tmp_path / "a.ply", expected_bytes=2 * free_bytes)
 
 

@@ -50,6 +50,11 @@ class Selection:
         "compute HU as SLOPE x stored value + INTERCEPT, regardless of the files, such as 1,-1024",
         parse=numbers_reader(2, "is no slope and intercept: SLOPE,INTERCEPT, such as 1,-1024"),
     )
+    voxel_size: tuple[float, float, float] | None = _reading_option(
+        "--voxel-size I,J,K",
+        "mm between voxels along i, j and k, i along the last axis of the array: for Zarr that does not say it in mm",
+        parse=numbers_reader(3, "is no size of a voxel: I,J,K in mm, such as 0.5,0.5,0.8"),
+    )
 
 
 class Rescale(NamedTuple):
@@ -60,6 +65,20 @@ class Rescale(NamedTuple):
 
     def __str__(self) -> str:
         return f"HU are {self.slope:g} x the stored value {self.intercept:+g}, as given: not what the files say"
+
+
+def check_voxel_size(given: Any) -> tuple[float, float, float] | None:
+    if given is None:
+        return None
+    try:
+        i, j, k = (float(number) for number in given)
+    except (TypeError, ValueError, OverflowError):
+        i = j = k = math.nan
+    if not all(0.0 < step <= LARGEST for step in (i, j, k)):
+        raise UsageError(
+            f"{name_parameter('voxel_size')} needs three lengths above 0 mm, up to {LARGEST:g}, not {given!r}"
+        )
+    return i, j, k
 
 
 def check_rescale(given: Any) -> Rescale | None:

@@ -328,9 +328,10 @@ def judge_grid(grid: GridFile, values: GridValues | None, value_gates: Sequence[
 log = get_logger(__name__)
 
 
-def read_grid(path: Path, kind: str, *, rescale: Rescale | None = None, progress: Progress | None = None) -> Volume:
-    """Read a volume of one of the kinds of `tell_kind`; a given rescale replaces that of the header."""
-    grid = _open_by_kind(path, kind, rescale)
+def read_grid(path: Path, kind: str, *, progress: Progress | None = None, **given: Any) -> Volume:
+    """Read a volume of one of the kinds of `tell_kind`; `given` are a rescale in place of that of the header, and a
+    voxel size where it has none, see `_open_by_kind`."""
+    grid = _open_by_kind(path, kind, **given)
     values = read_values(grid, progress)
     findings = _examine(grid, values)
     report = certify_grid(grid, values, _collect_warnings(grid, values, findings), findings)
@@ -368,10 +369,10 @@ def _collect_warnings(
 
 
 def list_grid(
-    path: Path, kind: str, *, rescale: Rescale | None = None, pixels: bool = False, progress: Progress | None = None
+    path: Path, kind: str, *, pixels: bool = False, progress: Progress | None = None, **given: Any
 ) -> SeriesListing:
     """List the one volume of a file, with its certificate, for `pixels` also by its voxels; see `read_grid`."""
-    grid = _open_by_kind(path, kind, rescale)
+    grid = _open_by_kind(path, kind, **given)
     values = read_values(grid, progress) if pixels else None
     findings = None if values is None else _examine(grid, values)
     warnings = _collect_warnings(grid, values, findings)
@@ -390,9 +391,11 @@ def list_grid(
     return SeriesListing([entry], 1, {}, [], certificate)
 
 
-def _open_by_kind(path: Path, kind: str, rescale: Rescale | None) -> GridFile:
+def _open_by_kind(
+    path: Path, kind: str, *, rescale: Rescale | None = None, voxel_size: Sequence[float] | None = None
+) -> GridFile:
     try:
-        grid = open_grid(path, kind, VOLUME)
+        grid = open_grid(path, kind, VOLUME) if voxel_size is None else open_zarr(path, VOLUME, voxel_size)
     except OSError as error:
         raise RefusedInputError(f"{escape_text(path.name)} cannot be read: {error.strerror or error}") from error
     if min(grid.shape_ijk) < 2:

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from clrecon.errors import ClreconError, RefusedInputError, UsageError
 from clrecon.geometry.affine import Float64Array, checked_affine, compose_affine
-from clrecon.reading.grids.grid_file import GridFile, import_extra
+from clrecon.reading.grids.grid_file import VOLUME, GridFile, import_extra
 from clrecon.reading.grids.nrrd import MM_PER_UNIT
+from clrecon.system.arguments import name_parameter
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.memory import iterate_layers
 from clrecon.system.text import escape_text
@@ -44,30 +45,41 @@ _ORIENTATIONS = {
 _UNPLACED = "the file does not say how its axes lie in the patient: x, y and z are taken for left, back and head (LPS)"
 
 
-def open_zarr(path: Path, purpose: str) -> GridFile:
+_ORDER = ("t", "c", "z", "y", "x")
+"""Axes of an array that does not name its own, the last ones."""
+
+
+def open_zarr(path: Path, purpose: str, voxel_size: Sequence[float] | None = None) -> GridFile:
+    """Open the first image of a folder, or for a `voxel_size` (i, j, k) in mm also an array without metadata."""
     name = escape_text(path.name)
+    advice = f": give it in mm with {name_parameter('voxel_size', 'I,J,K')}" if purpose == VOLUME else ""
     zarr = import_extra("zarr", purpose)
     stored = _list_files(path, name)
     with _telling(name, "its metadata"):
         group = zarr.open(str(path), mode="r")
         attributes = group.attrs.asdict()
         images = attributes.get("ome", attributes).get("multiscales", ())
-    if not images:
+    is_array = hasattr(group, "dtype")
+    if not images and not (is_array and voxel_size):
+        way_out = advice if is_array else ": name the folder of an image or of an array in it"
         raise RefusedInputError(
             f"{name} is Zarr without the metadata of an OME-Zarr image (multiscales), which say how far apart voxels"
-            " are: name the folder of an image in it, or read its array in Python (docs/formats.md)"
+            f" are{way_out}"
         )
     with _telling(name, "its metadata (multiscales)"):
-        level = images[0]["datasets"][0]
-        array = group[level["path"]]
-        axes = _read_axes(images[0], array, name)
-        steps = [*level.get("coordinateTransformations", ()), *images[0].get("coordinateTransformations", ())]
-        affine, is_placed = _read_affine(axes, steps, name)
+        image: Mapping[str, Any] = images[0] if images else {"axes": _ORDER[-group.ndim :], "datasets": [{"path": ""}]}
+        level = image["datasets"][0]
+        array = group[level["path"]] if images else group
+        axes = _read_axes(image, array, name)
+        steps = [*level.get("coordinateTransformations", ()), *image.get("coordinateTransformations", ())]
+        affine, is_placed = _read_affine(axes, steps, name, voxel_size, advice)
         folder = path / level["path"]
         files = [size for file, size in stored.items() if folder in file.parents and file.name not in _METADATA]
         missing = _count_missing(array, files, name)
+    steps_given = " x ".join(f"{step:g}" for step in voxel_size or ())
     warnings = [
         *([] if is_placed else [_UNPLACED]),
+        *([f"the voxels are {steps_given} mm apart, as given: the file does not say"] if voxel_size else []),
         *([f"the file has {len(images)} images: the first is read"] if len(images) > 1 else []),
         *([f"missing files: {missing:,}; {array.fill_value} stands for their voxels"] if missing else []),
     ]
@@ -167,9 +179,16 @@ def _list_spatial(axes: Sequence[Mapping[str, Any]]) -> list[int]:
 
 
 def _read_affine(
-    axes: Sequence[Mapping[str, Any]], transformations: Sequence[Mapping[str, Any]], name: str
+    axes: Sequence[Mapping[str, Any]],
+    transformations: Sequence[Mapping[str, Any]],
+    name: str,
+    voxel_size: Sequence[float] | None,
+    advice: str,
 ) -> tuple[Float64Array, bool]:
-    """Return the affine to LPS mm of the axes of space, the last of which is i, and whether they lie in a patient."""
+    """Return the affine to LPS mm of the axes of space, the last of which is i, and whether they lie in a patient.
+
+    A voxel size (i, j, k) is for axes without a scale or a unit; without it the `advice` is how to give it.
+    """
     scale, offset = np.ones(len(axes)), np.zeros(len(axes))
     kinds = [step["type"] for step in transformations]
     for kind, step in zip(kinds, transformations, strict=True):
@@ -184,9 +203,15 @@ def _read_affine(
             scale, offset = scale * numbers, offset * numbers
         else:
             offset = offset + numbers
-    if "scale" not in kinds:
-        raise RefusedInputError(f"{name} does not say how far apart its voxels are: it has no scale")
     spatial = _list_spatial(axes)
+    units = np.array([_MM_PER_UNIT.get(str(axes[axis].get("unit")).lower(), np.nan) for axis in spatial])
+    has_units = "scale" in kinds and not np.isnan(units).any()
+    if voxel_size is not None and has_units:
+        given = name_parameter("voxel_size")
+        raise UsageError(f"{name} says how far apart its voxels are, with a scale and units: leave {given} out")
+    if voxel_size is None and not has_units:
+        raise RefusedInputError(_explain_units(axes, spatial, kinds, name) + advice)
+    mm_per_unit = units if voxel_size is None else np.divide(voxel_size[::-1], np.abs(scale[spatial]))
     values = [str((axes[axis].get("orientation") or {}).get("value")) for axis in spatial]
     is_placed = all(value in _ORIENTATIONS for value in values)
     directions = np.zeros((3, 3))
@@ -195,7 +220,7 @@ def _read_affine(
         if not is_placed and word not in _PLAIN:
             raise RefusedInputError(f"{name} has an axis {escape_text(word, 20)}: axes of space are x, y and z")
         row, sign = _ORIENTATIONS[values[column]] if is_placed else (_PLAIN.index(word), 1.0)
-        directions[row, column] = sign * _read_unit(axes[axis], name)
+        directions[row, column] = sign * mm_per_unit[column]
     if np.linalg.matrix_rank(directions) < 3:
         raise RefusedInputError(f"{name} is corrupt: two of its axes have the same direction")
     k_step, j_step, i_step = (directions * scale[spatial]).T
@@ -205,15 +230,15 @@ def _read_affine(
         raise RefusedInputError(f"{name} cannot be placed: {error}") from error
 
 
-def _read_unit(axis: Mapping[str, Any], name: str) -> float:
-    """Return the millimetres of a unit."""
-    unit = axis.get("unit")
-    if unit is None:
-        word = escape_text(str(axis["name"]), 20)
-        raise RefusedInputError(f'{name} says no unit of its axis {word}: add "unit": "millimeter" to its metadata')
-    if str(unit).lower() not in _MM_PER_UNIT:
-        raise RefusedInputError(f"{name} has lengths in an unknown unit, {escape_text(str(unit), 20)}")
-    return _MM_PER_UNIT[str(unit).lower()]
+def _explain_units(axes: Sequence[Mapping[str, Any]], spatial: Sequence[int], kinds: Sequence[str], name: str) -> str:
+    """Say why the distance of the voxels is not known."""
+    if "scale" not in kinds:
+        return f"{name} does not say how far apart its voxels are, it has no scale"
+    axis = next(axes[axis] for axis in spatial if str(axes[axis].get("unit")).lower() not in _MM_PER_UNIT)
+    word, unit = (escape_text(str(axis.get(entry)), 20) for entry in ("name", "unit"))
+    if axis.get("unit") is None:
+        return f'{name} says no unit of its axis {word}, such as "unit": "millimeter" in its metadata'
+    return f"{name} has lengths in an unknown unit, {unit}"
 
 
 def _count_missing(array: Any, sizes: Sequence[int], name: str) -> int:

@@ -24,7 +24,7 @@ from clrecon.system.arguments import Space
 from clrecon.system.files import check_writable, replace_file
 from clrecon.system.paths import keep_existing
 from clrecon.system.progress import Progress
-from clrecon.system.text import count_of, escape_text
+from clrecon.system.text import count_of, escape_text, format_bytes
 from clrecon.viewer.drawing.painter import Painter
 from clrecon.viewer.model.measures import MEASURE_FORMATS, encode_measures
 from clrecon.viewer.model.objects import ShownCloud, ShownScan
@@ -110,7 +110,7 @@ def save_shown(
         if scale is not None and state.color_by is not None:
             picture = add_scale(picture, scale, MESH_COLORS[state.color_by])
         written = picture.save(path, no_clobber=no_clobber)
-        return [f"{name}: picture of {picture.size[0]} x {picture.size[1]} pixels, {_megabytes(written)}"]
+        return [f"{name}: picture of {picture.size[0]} x {picture.size[1]} pixels, {format_bytes(written)}"]
     if kind in ("measures", "view"):
         content = encode_view(state, painter.objects)
         if kind == "measures":
@@ -118,16 +118,16 @@ def save_shown(
         with keep_existing(keep=no_clobber):
             written = replace_file(path, lambda stream: stream.write(content), expected_bytes=len(content))
         words = "what is shown" if kind == "view" else count_of(len(state.measures), "measure")
-        return [f"{name}: {words}, {_megabytes(written)}"]
+        return [f"{name}: {words}, {format_bytes(written)}"]
     if kind == "volume":
         volume = shown_volume(painter, state, progress)
         ni, nj, nk = volume.shape_ijk
         written = volume.save(path, keep_ids=keep_ids, no_clobber=no_clobber, progress=progress)
-        return [f"{name}: volume of {ni} x {nj} x {nk} voxels, {_megabytes(written)}"]
+        return [f"{name}: volume of {ni} x {nj} x {nk} voxels, {format_bytes(written)}"]
     if kind == "cloud":
         cloud = shown_cloud(painter, state, progress)
         written = cloud.save(path, space, keep_ids=keep_ids, no_clobber=no_clobber)
-        return [f"{name}: {count_of(len(cloud), 'point')}, {_megabytes(written)}"]
+        return [f"{name}: {count_of(len(cloud), 'point')}, {format_bytes(written)}"]
     meshes = painter.mesh_of_shown(state, progress)
     triangles = sum(mesh.triangle_count for mesh in meshes)
     if Path(path).suffix.lower() in ASSEMBLIES and len(meshes) > 1:
@@ -136,7 +136,7 @@ def save_shown(
         written = staged.size
     else:
         written = _join_meshes(meshes).save(path, space, keep_ids=keep_ids, no_clobber=no_clobber)
-    return [f"{name}: {count_of(len(meshes), 'mesh', 'meshes')}, {triangles:,} triangles, {_megabytes(written)}"]
+    return [f"{name}: {count_of(len(meshes), 'mesh', 'meshes')}, {triangles:,} triangles, {format_bytes(written)}"]
 
 
 def shown_volume(painter: Painter, state: ViewState, progress: Progress | None = None) -> Volume:
@@ -209,7 +209,3 @@ def _join_meshes(meshes: Sequence[Mesh]) -> Mesh:
     triangles = [mesh.triangles.astype(np.int64) + start for mesh, start in zip(meshes, starts, strict=True)]
     report = {key: value for key, value in meshes[0].report.items() if key not in ("part_name", "color")}
     return Mesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(triangles), normals, report)
-
-
-def _megabytes(size: int) -> str:
-    return f"{size / 1e6:.1f} MB" if size >= 1e5 else f"{size / 1e3:.1f} kB"

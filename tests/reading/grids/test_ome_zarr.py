@@ -102,7 +102,7 @@ def set_place(*transformations: dict[str, Any]) -> Callable[[dict[str, Any]], No
 
 
 ODD: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
-    "no unit": (lambda image: image["axes"][2].pop("unit"), "x"),
+    "no unit": (lambda image: image["axes"][2].pop("unit"), "voxel_size"),
     "unknown unit": (set_axis(unit="parsec"), "parsec"),
     "no axes, as before 0.4": (leave_out("axes"), "axes"),
     "axes that are none": (lambda image: image.update(axes=[1, 2, 3]), "0"),
@@ -133,6 +133,44 @@ def test_metadata_that_place_no_volume_are_refused(tmp_path: Path, odd: str) -> 
         clrecon.read_volume(path)
 
 
+@pytest.mark.parametrize("version", [2, 3])
+def test_array_without_metadata_is_read_with_a_given_voxel_size_and_a_failed_gate(tmp_path: Path, version: int) -> None:
+    voxels = make_ct(SHAPE)
+    path = write_ome_zarr(tmp_path / "a.zarr", voxels, version=version) / "0"
+    volume = clrecon.read_volume(path, voxel_size=(0.5, 0.75, 2.5))
+    assert np.array_equal(volume.voxels, voxels)
+    assert np.array_equal(volume.affine, np.diag([0.5, 0.75, 2.5, 1.0]))
+    assert_facts(volume.report["warnings"][-1], 0.5, 0.75, 2.5, "given")
+    assert [gate["name"] for gate in volume.report["gates"] if gate["ok"] is False] == ["header_clear"]
+
+
+def test_given_voxel_size_is_the_step_of_axes_without_a_unit_and_their_origin_is_in_these_steps(tmp_path: Path) -> None:
+    axes = [{"name": name, "type": "space"} for name in "zyx"]
+    place = [{"type": "scale", "scale": [1, 1, 2]}, {"type": "translation", "translation": [-3, 0, 10]}]
+    path = write_ome_zarr(tmp_path / "a.zarr", make_ct(SHAPE), axes=axes, place=place)
+    affine = clrecon.read_volume(path, voxel_size=(0.5, 0.75, 2.5)).affine
+    assert np.array_equal(affine[:3, :3], np.diag([0.5, 0.75, 2.5]))
+    assert affine[:3, 3].tolist() == [2.5, 0.0, -7.5]  # 10 units of x are 5 of its steps, -3 of z 3
+
+
+def test_voxel_size_is_refused_where_the_metadata_have_one(tmp_path: Path) -> None:
+    path = write_ome_zarr(tmp_path / "a.zarr", make_ct(SHAPE))
+    with refused(UsageError, "a.zarr", "voxel_size"):
+        clrecon.read_volume(path, voxel_size=(1, 1, 1))
+
+
+def test_voxel_size_of_another_format_is_refused(tmp_path: Path) -> None:
+    path = write_nifti(tmp_path / "a.nii", make_ct(SHAPE), AFFINE)
+    with refused(UsageError, "voxel_size", "Zarr"):
+        clrecon.read_volume(path, voxel_size=(1, 1, 1))
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 1, 0), (1, 1, np.inf)], ids=["two", "zero", "infinite"])
+def test_voxel_size_that_is_none_is_refused(tmp_path: Path, size: Any) -> None:
+    with refused(UsageError, "voxel_size", "mm"):
+        clrecon.read_volume(tmp_path, voxel_size=size)
+
+
 def test_several_volumes_along_an_axis_are_refused_with_their_number(tmp_path: Path) -> None:
     place = [{"type": "scale", "scale": [1, 1, 1, 1]}]
     path = write_ome_zarr(tmp_path / "a.zarr", np.stack([make_ct(SHAPE)] * 3), axes=make_axes("czyx"), place=place)
@@ -143,7 +181,7 @@ def test_several_volumes_along_an_axis_are_refused_with_their_number(tmp_path: P
 @pytest.mark.parametrize("version", [2, 3])
 def test_array_without_metadata_of_an_image_is_refused(tmp_path: Path, version: int) -> None:
     path = write_ome_zarr(tmp_path / "a.zarr", make_ct(SHAPE), version=version) / "0"
-    with refused(RefusedInputError, "multiscales"):
+    with refused(RefusedInputError, "multiscales", "voxel_size"):
         clrecon.read_volume(path)
 
 
