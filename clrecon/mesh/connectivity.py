@@ -79,6 +79,11 @@ def find_used(numbers: IntArray, size: int) -> IntArray:
     return np.flatnonzero(used)
 
 
+def list_runs(first: IntArray, size: IntArray) -> IntArray:
+    """Return the whole numbers of runs one after the other, each of `size` from `first` on."""
+    return np.repeat(first - (np.cumsum(size) - size), size) + np.arange(int(size.sum()))
+
+
 def number_used(triangles: NDArray[np.uint32], vertex_count: int) -> tuple[IntArray, NDArray[np.uint32]]:
     """Return the vertices that some triangles use, ascending, and the triangles with the places of these as corners."""
     used = find_used(triangles.reshape(-1), vertex_count)
@@ -87,21 +92,27 @@ def number_used(triangles: NDArray[np.uint32], vertex_count: int) -> tuple[IntAr
     return used, places[triangles]
 
 
-class Fans:
-    """The triangles around each vertex: of vertex v `rows` from ``begin[v]`` to ``begin[v + 1]``, in their order."""
+class Lists:
+    """Rows by number: of number v `rows` from ``begin[v]`` to ``begin[v + 1]``, in their order."""
+
+    def __init__(self, numbers: IntArray, size: int):
+        self.rows = order_by_number(numbers, size)
+        self.begin = np.zeros(size + 1, dtype=np.int64)
+        np.cumsum(np.bincount(numbers, minlength=size), out=self.begin[1:])
+
+    def around(self, numbers: IntArray) -> tuple[IntArray, IntArray]:
+        """Return the rows of some numbers one after the other, and how many each number has."""
+        first = self.begin[numbers]
+        count = self.begin[numbers + 1] - first
+        return self.rows[list_runs(first, count)], count
+
+
+class Fans(Lists):
+    """The triangles around each vertex."""
 
     def __init__(self, triangles: NDArray[np.uint32], vertex_count: int):
-        corners = triangles.reshape(-1)
-        self.rows: IntArray = order_by_number(corners, vertex_count) // 3
-        self.begin = np.zeros(vertex_count + 1, dtype=np.int64)
-        np.cumsum(np.bincount(corners, minlength=vertex_count), out=self.begin[1:])
-
-    def around(self, vertices: IntArray) -> tuple[IntArray, IntArray]:
-        """Return the triangles around some vertices one after the other, and how many each vertex has."""
-        first = self.begin[vertices]
-        count = self.begin[vertices + 1] - first
-        start = np.cumsum(count) - count
-        return self.rows[np.arange(int(count.sum())) + np.repeat(first - start, count)], count
+        super().__init__(triangles.reshape(-1), vertex_count)
+        self.rows //= 3
 
     def touching(self, vertices: IntArray) -> IntArray:
         """Return the triangles that have one of some vertices, each once, in their order."""

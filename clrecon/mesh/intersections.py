@@ -33,8 +33,6 @@ _ROUNDING = 2.0**-50
 """Share of the sum of its absolute terms that the rounding of a volume or an area does not reach (Shewchuk 1997)."""
 
 Float64Array = NDArray[np.float64]
-FindCrossings = Callable[..., NDArray[np.int64]]
-"""Finds pairs of triangles that cut each other, from the same arguments as `find_self_intersections`."""
 
 
 def find_self_intersections(
@@ -107,18 +105,14 @@ def _leave_cut(
 
 
 def find_changed_intersections(
-    vertices: NDArray[np.floating],
-    triangles: NDArray[np.uint32],
-    changed: NDArray[np.bool_],
-    find_crossings: FindCrossings = find_self_intersections,
+    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], changed: NDArray[np.bool_]
 ) -> NDArray[np.int64]:
-    """Find the pairs of triangles that cut each other of which one changed; `find_crossings` is for many changed."""
+    """Find the pairs of triangles that cut each other of which one changed."""
     if not changed.any():
         return np.zeros((0, 2), dtype=np.int64)
     if np.count_nonzero(changed) > _FEW * len(triangles):
-        return find_crossings(vertices, triangles, None if changed.all() else changed)
-    rows = _find_meeting(vertices, triangles, changed)
-    rows = rows[find_beside(vertices, triangles[rows], changed[rows])]
+        return find_self_intersections(vertices, triangles, None if changed.all() else changed)
+    rows = np.flatnonzero(find_beside(vertices, triangles, changed))
     return rows[find_self_intersections(vertices, triangles[rows], changed[rows])]
 
 
@@ -128,23 +122,6 @@ def find_beside(
     """Find the changed triangles and those that can touch one of them: whose box shares a coarse cell with one."""
     low, high = find_boxes(vertices, triangles)
     return find_boxes_beside(low, high, low[changed], high[changed])
-
-
-def _find_meeting(
-    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], changed: NDArray[np.bool_]
-) -> NDArray[np.intp]:
-    """Return the triangles whose span along each axis meets that of a changed one, where these leave out many."""
-    low, high = find_boxes(vertices, triangles[changed])
-    rows = np.arange(len(triangles))
-    for axis in range(3):
-        order, corners = np.argsort(low[:, axis]), vertices[:, axis].take(triangles[rows].T)
-        before = np.searchsorted(low[order, axis], np.maximum.reduce(corners), side="right")
-        farthest = np.append(np.maximum.accumulate(high[order, axis]), -np.inf)
-        meets = farthest[before - 1] >= np.minimum.reduce(corners)
-        rows = rows[meets]
-        if 2 * len(rows) > len(meets):
-            break
-    return rows
 
 
 def find_boxes(

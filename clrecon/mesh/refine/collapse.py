@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.mesh.connectivity import Edges, Fans, find_split_vertices, order_by_number
+from clrecon.mesh.connectivity import Edges, Fans, Lists, find_split_vertices, list_runs
 from clrecon.system.light_dataclass import dataclass
 
 NONE = 0xFFFFFFFF
@@ -93,20 +93,33 @@ class History:
     begin: IntArray
     size: IntArray
     neighbours: IntArray
-    _beside: tuple[IntArray, IntArray] | None = None
+    _beside: Lists | None = None
 
     @property
     def count(self) -> int:
         return int(np.count_nonzero(self.into >= 0))
 
-    def names(self) -> IntArray:
+    def names(self) -> NDArray[np.uint32]:
         """Return for each vertex the one that it has become, shape (n,)."""
-        into = np.where(self.into >= 0, self.into, np.arange(len(self.into), dtype=self.into.dtype))
+        into = np.where(self.into >= 0, self.into, np.arange(len(self.into))).astype(np.uint32)
         while True:
             further = into[into]
             if np.array_equal(further, into):
                 return into
             into = further
+
+    def name_again(self, names: NDArray[np.uint32], standing: IntArray) -> IntArray:
+        """Give names to vertices that are there, and to those that they are made of; return all of these."""
+        names[standing] = standing
+        vertices, going = [standing], standing
+        while len(going):
+            others, size = self._collapses_beside().around(going)
+            names_of_others = np.repeat(names[going], size)
+            is_into = self.into[others] == np.repeat(going, size)
+            going = others[is_into]
+            names[going] = names_of_others[is_into]
+            vertices.append(going)
+        return np.concatenate(vertices)
 
     def latest(self) -> IntArray:
         """Return the last collapse into each vertex, -1 where there is none."""
@@ -125,13 +138,9 @@ class History:
         """
         undone = np.zeros(len(self.into), dtype=bool)
         going = np.unique(collapses)
-        begin, beside = self._collapses_beside()
         while len(going):
             undone[going] = True
-            stayed = self.into[going]
-            size = begin[stayed + 1] - begin[stayed]
-            first = np.repeat(begin[stayed] - (np.cumsum(size) - size), size)
-            others = beside[first + np.arange(len(first))]
+            others, size = self._collapses_beside().around(self.into[going])
             later = self.rounds[others] > np.repeat(self.rounds[going], size)
             going = np.unique(others[later & ~undone[others] & (self.into[others] >= 0)])
         gone = np.flatnonzero(undone)
@@ -141,18 +150,14 @@ class History:
         self.into[gone] = self.rounds[gone] = -1
         return np.unique(np.concatenate([gone, stayed]))
 
-    def _collapses_beside(self) -> tuple[IntArray, IntArray]:
-        """Return the collapses that have each vertex at one end or in the ring, as rows."""
+    def _collapses_beside(self) -> Lists:
+        """Return the collapses that have each vertex at one end or in the ring."""
         if self._beside is None:
             gone = np.flatnonzero(self.into >= 0)
-            size = self.size[gone]
-            owner = np.repeat(gone, size)
-            first = np.repeat(self.begin[gone] - (np.cumsum(size) - size), size)
-            vertex = np.concatenate([self.neighbours[first + np.arange(len(first))], self.into[gone], gone])
-            owner = np.concatenate([owner, gone, gone])
-            begin = np.zeros(len(self.into) + 1, dtype=np.int64)
-            np.cumsum(np.bincount(vertex, minlength=len(self.into)), out=begin[1:])
-            self._beside = begin, owner[order_by_number(vertex, len(self.into))]
+            ring = self.neighbours[list_runs(self.begin[gone], self.size[gone])]
+            self._beside = Lists(np.concatenate([ring, self.into[gone], gone]), len(self.into))
+            owner = np.concatenate([np.repeat(gone, self.size[gone]), gone, gone])
+            self._beside.rows = owner[self._beside.rows]
         return self._beside
 
 
@@ -187,11 +192,14 @@ class Collapser(Protocol):
     def finish(self) -> tuple[History, Pairing]:
         """Return the collapses, and where the surfaces are near each other."""
 
-    def show_present(self, places: Float32Array, faces: NDArray[np.uint32], rows: IntArray, changed: IntArray) -> None:
+    def show_present(
+        self, places: Float32Array, corners: NDArray[np.uint32], rows: IntArray, changed: IntArray
+    ) -> None:
         """Bring the present surface to the device, of which some faces have changed since the last time.
 
-        places: ndarray, shape (n, 3). Of given vertices, as `faces`, shape (k, 3).
-        rows: ndarray, shape (k,). The given triangle from which each face comes; their numbers are those of faces.
+        places: ndarray, shape (n, 3). Of given vertices.
+        corners: ndarray, shape (m, 3). What the corners of given triangles have become.
+        rows, changed: Those that are faces, and those of them that have changed.
         """
 
     def find_near_faces(

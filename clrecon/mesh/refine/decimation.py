@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.exchange.coordinates import as_stored, find_coincident, rounding_step
 from clrecon.mesh.compare.distances import rounding_of_bounds
-from clrecon.mesh.connectivity import find_edges, find_used, label_components, number_used, order_by_number
-from clrecon.mesh.intersections import FindCrossings, find_changed_intersections, find_self_intersections
+from clrecon.mesh.connectivity import find_edges, label_components, number_used, order_by_number
+from clrecon.mesh.intersections import find_changed_intersections
 from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.refine.collapse import FAR, SEVERAL, Collapser, Surface, collapse_in_rounds
+from clrecon.mesh.refine.shifts import Follow, follow_none
 from clrecon.mesh.refine.topology import TopologyChange, any_corner, compare_topology, measure_topology
 from clrecon.mesh.triangle_tree import Curve
 from clrecon.mesh.triangles import cross_products, vertex_normals
@@ -96,16 +97,16 @@ def decimate_mesh(
     *,
     progress: Progress | None = None,
     make_collapser: MakeCollapser,
-    find_crossings: FindCrossings = find_self_intersections,
+    follow: Follow = follow_none,
 ) -> Mesh:
     """Remove triangles within a bound, see `clrecon.operators.surface.decimation.decimate_mesh`.
 
     make_collapser: Makes a `Collapser` from a surface and the square of a distance, mm2.
-    find_crossings: `find_self_intersections`, or what finds the same elsewhere.
+    follow: Returns marks of the faces that may cut another one; None where all are looked at.
     """
     check_share(fraction)
     bound = check_refinement(mesh, max_deviation_mm)
-    decimation = _Decimation(mesh, bound, make_collapser, find_crossings)
+    decimation = _Decimation(mesh, bound, make_collapser, follow)
     wanted = (1.0 - fraction) * mesh.triangle_count
 
     def tell_left(left: int) -> None:
@@ -148,8 +149,8 @@ def _sort_along_curve(mesh: Mesh) -> tuple[Mesh, IntArray, IntArray]:
 class _Decimation:
     """A mesh whose edges collapse, and come back where the result would be at fault."""
 
-    def __init__(self, mesh: Mesh, bound: float, make_collapser: MakeCollapser, find_crossings: FindCrossings):
-        self._find_crossings = find_crossings
+    def __init__(self, mesh: Mesh, bound: float, make_collapser: MakeCollapser, follow: Follow):
+        self._follow = follow
         mesh, self._order, self._order_of_faces = _sort_along_curve(mesh)
         self._mesh = mesh
         self._origin = local_origin(mesh.vertices)
@@ -169,81 +170,86 @@ class _Decimation:
 
     def mend(self) -> int:
         """Undo collapses until no fault is left; return their number."""
-        before = self._history.count
-        self._witnesses = np.full((4, self._mesh.triangle_count), SEVERAL, np.int32)
-        self._is_new = np.ones(self._mesh.vertex_count, dtype=bool)
-        self._is_shifted = np.zeros(self._mesh.vertex_count, dtype=bool)
-        self._kind = as_stored(self._history.places + self._origin).dtype
+        history, triangles = self._history, self._mesh.triangles
+        before, count = history.count, len(triangles)
+        self._kind = as_stored(history.places + self._origin).dtype
         self._stored = self._mesh.vertices.astype(np.result_type(self._kind, self._mesh.vertices))
-        while True:
-            self._name()
-            collapses = self._latest_of([*self._find_far(), *self._find_unsound()])
-            if len(collapses) == 0:
-                return before - self._history.count
-            self._is_new[:] = False
-            self._is_new[self._history.undo(collapses)] = True
+        self._names, self._faces = history.names(), np.empty_like(triangles)
+        self._has_moved, self._is_face = np.zeros(len(self._names), bool), np.zeros(count, bool)
+        self._witnesses = np.full((4, count), SEVERAL, np.int32)
+        new = self._take_over(np.arange(len(self._names)), np.arange(count))
+        marks = self._follow(self._stored, self._faces, new)
+        suspects = new if marks is None else marks.look()
+        while len(collapses := self._latest_of([*self._find_far(new), *self._find_unsound(suspects, new)])):
+            vertices = history.name_again(self._names, history.undo(collapses))
+            new = self._take_over(vertices, self._given.fans.touching(vertices))
+            suspects = np.flatnonzero(self._is_face) if marks is None else marks.look_again(self._stored, new)
+        return before - history.count
 
-    def _name(self) -> None:
-        """Find the present faces, the given triangles that they come from, and the places as they will be stored."""
-        self._names = self._history.names()
-        named = self._names.astype(np.uint32).take(self._mesh.triangles)
-        a, b, c = named.T
-        self._rows = np.flatnonzero((a != b) & (b != c) & (c != a))
-        self._faces = named.take(self._rows, axis=0)
-        self._is_new_face = any_corner(self._is_new, self._faces)
-        new = np.flatnonzero(self._is_new)
-        places, given = self._history.places.take(new, axis=0), self._mesh.vertices.take(new, axis=0)
-        shifted = (places != self._given.places.take(new, axis=0)).any(axis=1)
-        stored = (places + self._origin).astype(self._kind)
-        self._stored[new] = np.where(shifted[:, None], stored, given)
-        self._is_shifted[new] = shifted
-        self._has_moved = self._is_shifted | (self._names != np.arange(len(self._names)))
+    def _take_over(self, vertices: IntArray, rows: IntArray) -> IntArray:
+        """Take over what has become of given vertices, and of triangles; return those of these that are faces.
 
-    def _find_far(self) -> Iterator[IntArray]:
+        A face has the number of the given triangle that it comes from; its places are those that will be stored.
+        """
+        places, given = self._history.places.take(vertices, axis=0), self._mesh.vertices.take(vertices, axis=0)
+        shifted = (places != self._given.places.take(vertices, axis=0)).any(axis=1)
+        self._stored[vertices] = np.where(shifted[:, None], (places + self._origin).astype(self._kind), given)
+        self._has_moved[vertices] = shifted | (self._names[vertices] != vertices)
+        faces = self._names.take(self._mesh.triangles.take(rows, axis=0))
+        self._faces[rows] = faces
+        a, b, c = faces.T
+        self._is_face[rows] = is_face = (a != b) & (b != c) & (c != a)
+        return rows[is_face]
+
+    def _find_far(self, new: IntArray) -> Iterator[IntArray]:
         """Find the names at triangles that are not seen to lie within the bound of the other surface.
 
         Given triangles are looked at again if one of the faces that were near has changed.
         """
         places = self._history.places
-        new = np.flatnonzero(self._is_new_face)
-        self._collapser.show_present(places, self._faces, self._rows, new)
-        rows = self._find_unseen(self._rows[new])
-        corners = self._mesh.triangles.take(rows, axis=0)
-        names = self._names.take(corners)
-        hints = np.column_stack([self._pairing.faces_at[rows], names]).astype(np.int32, copy=False)
+        self._collapser.show_present(places, self._faces, np.flatnonzero(self._is_face), new)
+        rows = self._find_unseen(new)
+        corners, names = self._mesh.triangles.take(rows, axis=0), self._faces.take(rows, axis=0)
+        hints = np.column_stack([self._pairing.faces_at[rows], names.view(np.int32)]).astype(np.int32, copy=False)
         near = self._collapser.find_near_faces(self._given.places.take(corners, axis=0), hints, True, self._limit)
         self._witnesses[:, rows] = near.T
         yield names[near[:, 0] == FAR]
         faces = new[any_corner(self._has_moved, self._faces.take(new, axis=0))]
         corners = self._faces.take(faces, axis=0)
-        hints = np.column_stack([self._pairing.below[self._rows[faces]], self._pairing.homes.take(corners)])
+        hints = np.column_stack([self._pairing.below[faces], self._pairing.homes.take(corners)])
         hints = hints.astype(np.int32, copy=False)
         near = self._collapser.find_near_faces(places.take(corners, axis=0), hints, False, self._limit)
         yield corners[near[:, 0] == FAR]
 
     def _find_unseen(self, new: IntArray) -> IntArray:
         """Find given triangles that have moved and that no face that is still there shows to be near."""
-        is_unseen = np.zeros(self._mesh.triangle_count - FAR, dtype=bool)
+        is_unseen = np.zeros(len(self._is_face) - FAR, dtype=bool)
         is_unseen[new] = True
         is_unseen[[SEVERAL, FAR]] = True  # from the end, and -1 is no face
-        has_none = np.logical_or.reduce([is_unseen[faces] for faces in self._witnesses])
+        first, *others = self._witnesses
+        has_none, more = is_unseen[first], np.flatnonzero(others[0] != -1)
+        for faces in others:
+            has_none[more] |= is_unseen[faces[more]]
         rows = np.flatnonzero(has_none)
         return rows[any_corner(self._has_moved, self._mesh.triangles.take(rows, axis=0))]
 
-    def _find_unsound(self) -> Iterator[IntArray]:
-        """Find the names at faces that cut each other or have no area, and at vertices that coincide."""
-        pairs = find_changed_intersections(self._stored, self._faces, self._is_new_face, self._find_crossings)
-        yield self._faces[pairs].reshape(-1, 6)
-        new = self._faces[self._is_new_face]
-        for piece, _, cross in cross_products(self._stored, new, self._origin):
-            yield new[piece][~cross.any(axis=0)]
-        standing = find_used(self._faces, len(self._stored))
-        yield standing[find_coincident(self._stored[standing])][:, None]
+    def _find_unsound(self, suspects: IntArray, new: IntArray) -> Iterator[IntArray]:
+        """Find among some faces names: at new ones that cut others or have no area, and at vertices that coincide."""
+        is_new = np.zeros(len(self._is_face), dtype=bool)
+        is_new[new] = True
+        used, corners = number_used(self._faces.take(suspects, axis=0), len(self._stored))
+        places, is_new = self._stored.take(used, axis=0), is_new[suspects]
+        pairs = find_changed_intersections(places, corners, is_new)
+        yield used[corners[pairs]].reshape(-1, 6)
+        of_new = corners[is_new]
+        for piece, _, cross in cross_products(places, of_new, self._origin):
+            yield used[of_new[piece][~cross.any(axis=0)]]
+        yield used[find_coincident(places)][:, None]
 
     def _latest_of(self, places: list[IntArray]) -> IntArray:
         """Return the last collapse into any vertex of each place, shape (k, v); none where it is as it was given."""
         latest = self._history.latest()
-        lists = [np.zeros(0, dtype=np.int64)]
+        lists: list[IntArray] = [np.zeros(0, dtype=np.int64)]
         for names in places:
             collapses = latest[names]
             rounds = np.where(collapses >= 0, self._history.rounds[collapses], -1)
@@ -256,8 +262,10 @@ class _Decimation:
         triangles, count = self._mesh.triangles, self._mesh.vertex_count
         components, labels = label_components(triangles, count, self._edges)
         before = measure_topology(triangles, labels, components, self._edges)
-        after = measure_topology(self._faces, labels, components)
-        corners = self._order[self._faces[np.argsort(self._order_of_faces[self._rows])]].astype(np.uint32)
+        rows = np.flatnonzero(self._is_face)
+        after = measure_topology(self._faces[rows], labels, components)
+        rows = rows[np.argsort(self._order_of_faces[rows])]
+        corners = self._order[self._faces[rows]].astype(np.uint32)
         standing, faces = number_used(corners, count)
         stored = np.empty_like(self._stored)
         stored[self._order] = self._stored

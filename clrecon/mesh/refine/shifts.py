@@ -10,14 +10,7 @@ from numpy.typing import NDArray
 
 from clrecon.exchange.coordinates import as_stored, find_coincident
 from clrecon.mesh.connectivity import Fans, find_used, number_used, order_by_number
-from clrecon.mesh.intersections import (
-    FindCrossings,
-    find_beside,
-    find_boxes,
-    find_boxes_beside,
-    find_changed_intersections,
-    find_self_intersections,
-)
+from clrecon.mesh.intersections import find_beside, find_boxes, find_boxes_beside, find_changed_intersections
 from clrecon.mesh.triangles import cross_products
 from clrecon.system.pieces import find_bounds
 
@@ -54,11 +47,11 @@ class Marks(Protocol):
     def look_again(self, vertices: NDArray[np.float32], changed: IntArray, /) -> IntArray: ...
 
 
-Follow = Callable[[NDArray[np.floating], NDArray[np.uint32]], Marks | None]
-"""Returns marks of a surface before its vertices are moved; None where nothing marks."""
+Follow = Callable[..., Marks | None]
+"""Returns marks of triangles, or of some rows of these, before vertices are moved; None where nothing marks."""
 
 
-def follow_none(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> None:
+def follow_none(vertices: NDArray[np.floating], triangles: NDArray[np.uint32], rows: IntArray | None = None) -> None:
     """Return no marks: all triangles are looked at, and then what lies near to changed ones."""
 
 
@@ -66,7 +59,6 @@ def move_vertices(
     vertices: NDArray[np.floating],
     triangles: NDArray[np.uint32],
     step: Float64Array,
-    find_crossings: FindCrossings = find_self_intersections,
     find_changed: Callable[[NDArray[np.floating], Float64Array], IntArray] | None = None,
     fans: Fans | None = None,
     follow: Follow = follow_none,
@@ -86,7 +78,7 @@ def move_vertices(
     marks = follow(moved, triangles)
     changed = np.ones(len(triangles), dtype=bool)
     spoilt: IntArray = (
-        _find_spoilt(moved, triangles, changed, find_crossings)
+        _find_spoilt(moved, triangles, changed)
         if marks is None
         else _find_spoilt_among(marks.look(), moved, triangles, changed)
     )
@@ -111,7 +103,7 @@ def move_vertices(
         changed[rows] = True
         if marks is None:
             near = near or _Near(vertices, moved, triangles)
-            spoilt = near.find_spoilt(changed, find_crossings)
+            spoilt = near.find_spoilt(changed)
         else:
             spoilt = _find_spoilt_among(marks.look_again(moved, rows), moved, triangles, changed)
     return moved, int(np.count_nonzero(share < 1.0))
@@ -133,41 +125,32 @@ class _Near:
         self._low = np.minimum.reduceat(find_boxes(low, rows)[0], starts)
         self._high = np.maximum.reduceat(find_boxes(high, rows)[1], starts)
 
-    def find_spoilt(self, changed: NDArray[np.bool_], find_crossings: FindCrossings) -> IntArray:
+    def find_spoilt(self, changed: NDArray[np.bool_]) -> IntArray:
         """Find the vertices of spoilt triangles after these triangles have changed."""
         moved = self._moved
         boxes = find_boxes(moved, self._triangles[changed])
         pieces = find_boxes_beside(self._low, self._high, *boxes)
         rows = np.sort(self._order[np.repeat(pieces, _IN_A_BLOCK)[: len(changed)]])
         rows = rows[find_beside(moved, self._triangles[rows], changed[rows])]
-        return _find_spoilt_among(rows, moved, self._triangles, changed, find_crossings)
+        return _find_spoilt_among(rows, moved, self._triangles, changed)
 
 
 def _find_spoilt_among(
-    rows: IntArray,
-    vertices: NDArray[np.floating],
-    triangles: NDArray[np.uint32],
-    changed: NDArray[np.bool_],
-    find_crossings: FindCrossings = find_self_intersections,
+    rows: IntArray, vertices: NDArray[np.floating], triangles: NDArray[np.uint32], changed: NDArray[np.bool_]
 ) -> IntArray:
     """Do what `_find_spoilt` does among some rows of the triangles."""
     if len(rows) == 0:
         return rows
     used, corners = number_used(triangles[rows], len(vertices))
-    return used[_find_spoilt(vertices[used], corners, changed[rows], find_crossings)]
+    return used[_find_spoilt(vertices[used], corners, changed[rows])]
 
 
-def _find_spoilt(
-    vertices: NDArray[np.floating],
-    triangles: NDArray[np.uint32],
-    look_at: NDArray[np.bool_],
-    find_crossings: FindCrossings,
-) -> IntArray:
+def _find_spoilt(vertices: NDArray[np.floating], triangles: NDArray[np.uint32], look_at: NDArray[np.bool_]) -> IntArray:
     """Find vertices of triangles without area, of triangles that cut each other, and vertices that coincide."""
     flat = [
         where.start + np.flatnonzero(~cross.any(axis=0))
         for where, _, cross in cross_products(vertices, triangles, np.zeros(3))
     ]
-    cut = triangles[find_changed_intersections(vertices, triangles, look_at, find_crossings)]
+    cut = triangles[find_changed_intersections(vertices, triangles, look_at)]
     suspects = [triangles[np.concatenate(flat)].reshape(-1), cut.reshape(-1), find_coincident(vertices)]
     return find_used(np.concatenate(suspects).astype(np.int64), len(vertices))

@@ -200,12 +200,12 @@ class DeviceCollapser:
             buffers.clear()
         return history, pairing
 
-    def show_present(self, places: Float32Array, faces: NDArray[np.uint32], rows: IntArray, changed: IntArray) -> None:
-        fans, corners = Fans(faces, self._count), np.zeros((self._faces, 3), np.uint32)
-        corners[rows] = faces
-        around = fans.begin, rows[fans.rows]
-        vertices = find_used(faces[changed], self._count)
-        self._load_target(self._present, places, corners, around, rows[changed], vertices)
+    def show_present(
+        self, places: Float32Array, corners: NDArray[np.uint32], rows: IntArray, changed: IntArray
+    ) -> None:
+        fans = Fans(corners.take(rows, axis=0), self._count)
+        around, vertices = (fans.begin, rows[fans.rows]), find_used(corners[changed], self._count)
+        self._load_target(self._present, places, corners, around, changed, vertices)
 
     def find_near_faces(
         self, corners: Float32Array, hints: NDArray[np.int32], present: bool, limit: float

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -69,11 +70,13 @@ class CrossingPlan:
 
 
 def plan_crossings(
-    vertices: Float32Array, triangles: NDArray[np.uint32], *, most_rows: int = _MOST_ROWS
+    vertices: Float32Array, triangles: NDArray[np.uint32], rows: IntArray | None = None, *, most_rows: int = _MOST_ROWS
 ) -> CrossingPlan:
-    """Enter at least one triangle into rows."""
+    """Enter at least one triangle into rows; those of `rows` alone where they are given."""
     exponent = 11 - int(np.frexp(np.abs(vertices).max())[1])
-    return _enter_into_rows(np.ldexp(vertices, exponent), exponent, triangles, most_rows)
+    entered = triangles if rows is None else triangles[rows]
+    plan = _enter_into_rows(np.ldexp(vertices, exponent), exponent, entered, most_rows)
+    return plan if rows is None else replace(plan, triangles=triangles, order=rows.astype(np.uint32)[plan.order])
 
 
 def _enter_into_rows(
@@ -116,11 +119,12 @@ class CrossingMarks:
     def __init__(self, device: Device, plan: CrossingPlan, *, spare: int = 0):
         self._device = device
         self._program = ocl.load_program(device, "surface/crossings.cl", {"LANES": device.kernel_variants["LANES"]})
-        self._stride = plan.stride + spare
-        self._places_d, self._names_d = (ocl.allocate(device, 4 * rows * self._stride) for rows in (10, 3))
+        self._spare = spare
         self._forget(plan)
 
     def _forget(self, plan: CrossingPlan) -> None:
+        self._stride = plan.stride + self._spare
+        self._places_d, self._names_d = (ocl.allocate(self._device, 4 * rows * self._stride) for rows in (10, 3))
         self._plan = plan
         self._rows = self._starts = np.zeros(0, np.uint32)
         self._levels, self._edges = np.zeros((0, 4), np.uint32), np.zeros((0, 4), np.float32)
@@ -133,7 +137,8 @@ class CrossingMarks:
         """Return the same of triangles that have changed, and what they may cut; of all where there is no room left."""
         plan, triangles = self._plan, self._plan.triangles[changed]
         if len(self._rows) + len(changed) + _MOST_LANES > self._stride:
-            self._forget(plan_crossings(vertices, plan.triangles))
+            rows = find_used(np.concatenate([self._rows, changed]), len(plan.triangles))
+            self._forget(plan_crossings(vertices, plan.triangles, rows))
             return self.look()
         used = find_used(triangles, len(vertices))
         plan.vertices[used] = np.ldexp(vertices[used], plan.exponent)
@@ -169,26 +174,29 @@ class CrossingMarks:
                 steps.take(items)
         words = ocl.download(device, np.empty((self._stride + 31) // 32, np.uint32), marks_d)
         entries = np.flatnonzero(np.unpackbits(words.view(np.uint8), bitorder="little"))
-        return find_used(self._rows[entries], len(self._plan.order))
+        return find_used(self._rows[entries], len(self._plan.triangles))
 
 
 def follow_crossings(
-    device: Device, vertices: NDArray[np.floating], triangles: NDArray[np.uint32], *, fewest: int = _FEWEST
-) -> CrossingMarks | None:
-    """Return marks of triangles of a surface that is about to change; None where `find_crossings` asks the host."""
-    if len(triangles) < fewest or vertices.dtype != np.float32:
+    device: Device, vertices: NDArray[np.floating], triangles: NDArray[np.uint32], rows: IntArray | None = None, *,
+    fewest: int = _FEWEST, memory: int | None = None,
+) -> CrossingMarks | None:  # fmt: skip
+    """Return marks of triangles, or of some rows of these, of a surface that is about to change; None where
+    `find_crossings` asks the host.
+    """
+    count = len(triangles if rows is None else rows)
+    if count < fewest or vertices.dtype != np.float32:
         return None
-    plan = plan_crossings(vertices, triangles)
-    spare = len(triangles) // 8
+    plan, spare = plan_crossings(vertices, triangles, rows), count // 8
     needs = {**plan.needs(), "changed triangles": 52 * spare}
-    return None if ocl.describe_shortage(ocl.memory_limits(device), needs) else CrossingMarks(device, plan, spare=spare)
+    has_room = not ocl.describe_shortage(ocl.memory_limits(device, memory), needs)
+    return CrossingMarks(device, plan, spare=spare) if has_room else None
 
 
 def find_crossings(
     device: Device,
     vertices: NDArray[np.floating],
     triangles: NDArray[np.uint32],
-    changed: NDArray[np.bool_] | None = None,
     *,
     fewest: int = _FEWEST,
     memory: int | None = None,
@@ -197,17 +205,17 @@ def find_crossings(
     """Find the pairs of triangles that cut each other, (k, 2) int64, see
     `clrecon.mesh.intersections.find_self_intersections`.
 
-    With `changed`, (n,) bool, only pairs with one of these.  Fewer triangles than `fewest`, float64 vertices and meshes
+    Fewer triangles than `fewest`, float64 vertices and meshes
     without room on the device are left to the host, which finds the same pairs.  `steps` counts the triangles.
     """
     if len(triangles) < fewest or vertices.dtype != np.float32:
-        return find_self_intersections(vertices, triangles, changed, steps=steps)
+        return find_self_intersections(vertices, triangles, steps=steps)
     plan = plan_crossings(vertices, triangles)
     if ocl.describe_shortage(ocl.memory_limits(device, memory), plan.needs()):
-        return find_self_intersections(vertices, triangles, changed, steps=steps)
+        return find_self_intersections(vertices, triangles, steps=steps)
     marked = CrossingMarks(device, plan).look(steps=steps).astype(np.int64)
     used, corners = number_used(triangles[marked], len(vertices))
-    return marked[find_self_intersections(vertices[used], corners, None if changed is None else changed[marked])]
+    return marked[find_self_intersections(vertices[used], corners)]
 
 
 @explains_arguments
@@ -266,6 +274,6 @@ def decimate_mesh(
             decimated = decimation.decimate_mesh(
                 mesh, fraction, max_deviation_mm, progress=progress,
                 make_collapser=partial(DeviceCollapser, current, memory=memory),
-                find_crossings=partial(find_crossings, current, memory=memory),
+                follow=partial(follow_crossings, current, memory=memory),
             )  # fmt: skip
     return decimated
