@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
 from functools import partial
 from typing import TYPE_CHECKING
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING
 from clrecon.cli import common
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import add_mesh_options, mesh_fields
+from clrecon.errors import UsageError
 from clrecon.jobs.batch.plan import COLUMNS, PAGE, TABLE, BatchSettings, Plan, read_cases
 from clrecon.jobs.mesh.purposes import settings_for
 from clrecon.jobs.mesh.settings import MeshSettings
@@ -33,6 +35,7 @@ examples:
   clrecon batch cohort.csv -o OUT --hu 300
   clrecon batch CT_FOLDER -o OUT --format ply --workers 2
   clrecon batch cohort.csv -o OUT --hu 300 --resume
+  clrecon batch cohort.csv -o OUT --hu 300 --state shown.view.json
   clrecon batch cohort.csv -o OUT --hu 300 --part 3/40
   clrecon batch cohort.csv -o OUT --collect"""
 
@@ -55,6 +58,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     batch = common.make_settings(BatchSettings, options)
     cases = read_cases(options.input, common.make_settings(ScanSettings, options))
     is_labelled = {case.labels is not None for case in cases}
+    view = {} if batch.state is None else _carry_view(batch.state, is_labelled)
     plan = Plan(
         output=options.output,
         batch=batch,
@@ -63,6 +67,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         options=getattr(current_speaker(), "options", None),
         timeout=DEFAULT_SECONDS if options.timeout is None else options.timeout,
         no_clobber=options.no_clobber,
+        **view,
     )
 
     def tell_outcome(outcome: Outcome) -> None:
@@ -82,6 +87,17 @@ def run(options: argparse.Namespace, console: Console) -> int:
     for line in _describe_batch(report, options.output, is_part=batch.part is not None):
         console.say(line)
     return report.exit_code
+
+
+def _carry_view(path: str, is_labelled: set[bool]) -> dict[str, str]:
+    """Return the entries of a plan of what a saved view shows of the cases, and by what it is drawn."""
+    from clrecon.viewer.model.saved_view import carry_view, read_view
+    from clrecon.viewer.session.opening import draw_carried
+
+    view = carry_view(read_view(path))
+    if False in is_labelled and "labels" in view["objects"]:
+        raise UsageError(f"the saved view shows a label map: name one in the column {COLUMNS[3]} of each row")
+    return {"carried": json.dumps(view, sort_keys=True), "drawer": f"{draw_carried.__module__}:{draw_carried.__name__}"}
 
 
 def _make_settings(options: argparse.Namespace, labels: str | None) -> MeshSettings:

@@ -12,11 +12,11 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 101_476,
+    "lines": 101_613,
     "modules": 441,
     "small_modules_with_one_reader": 7,
     "docstrings_with_raises": 139,
-    "options_in_several_files": 8,
+    "options_in_several_files": 9,
     "modules_with_own_all": 0,
 }
 """Who takes something away lowers the figure in the same commit; who needs more says why in the commit."""

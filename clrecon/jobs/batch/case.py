@@ -11,6 +11,7 @@ from contextlib import contextmanager, suppress
 from importlib import import_module
 from itertools import chain
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, NamedTuple, NoReturn
 
 from clrecon.errors import ClreconError, DeviceError, OutputError, UnreachableError
@@ -154,7 +155,7 @@ def _fill_folder(case: Case, plan: Plan, run: Run, folder: Path, key: str | None
     from clrecon.jobs.mesh.surfaces import names_level
 
     settings, asked = plan.settings_of(case), plan.batch
-    shared = None if case.labels is None and asked.cloud is None else SharedScan()
+    shared = None if (case.labels, asked.cloud, plan.drawer) == (None, None, None) else SharedScan()
     mesh = make_mesh(case.source, folder / f"mesh{asked.format}", settings, measure=asked.measure, shared=shared)
     run.lap("mesh")
     warnings = list(mesh.warnings)
@@ -172,7 +173,13 @@ def _fill_folder(case: Case, plan: Plan, run: Run, folder: Path, key: str | None
     if asked.cloud is not None:
         warnings += _write_cloud(case, folder, asked.cloud, settings, mesh.iso_value_hu, shared)
         run.lap("cloud")
-    if asked.picture:
+    if shared is not None and plan.drawer is not None:
+        draw = resolve_name(plan.drawer)
+        scan = MeshSettings(**_settings_in(settings, InputSettings))
+        how = {"size": _PICTURE_SIZE, "carried": plan.carried, "read": shared.read}
+        warnings += draw(case.source, case.labels, scan, folder / PICTURE, **how)
+        run.lap("picture")
+    elif asked.picture:
         warnings += _take_pictures(folder, asked, settings)
         run.lap("picture")
     if not asked.mesh:

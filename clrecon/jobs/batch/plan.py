@@ -111,6 +111,13 @@ class BatchSettings:
         parse=_parse_views,
         words=_VIEWS,
     )
+    state: str | None = option(
+        "--state FILE",
+        "draw each case as in a saved view (.view.json) of one scan: from its direction, framed anew, without what lies"
+        " at a place in that patient",
+        group="make",
+        first=True,
+    )
     workers: int | None = option(
         "--workers N", "processes that run cases in parallel (default: one for each device)", group="run", first=True
     )
@@ -155,6 +162,9 @@ class BatchSettings:
         _check_extension("format", self.format, MESH_INPUTS)
         if self.cloud is not None:
             _check_extension("cloud", self.cloud, CLOUD_FORMATS)
+        if self.state is not None and not (self.picture and self.views == (_VIEWS[0],)):
+            option_beside = name_parameter("views") if self.picture else name_parameter("picture", True)
+            raise UsageError(f"{name_parameter('state')} draws one picture as saved: leave {option_beside} out, or it")
         if self.workers is not None and not 1 <= self.workers <= _MOST_WORKERS:
             raise UsageError(f"a batch takes 1 to {_MOST_WORKERS} workers, not {self.workers}")
         if self.devices not in (None, ALL_DEVICES) and not all(
@@ -195,6 +205,8 @@ class Plan:
 
     plain, labelled: Settings of the meshes of cases without and with a label map, whose path each case has itself.
     options: Names of parameters in the messages of a worker, see `OptionSpeaker`; None: as in Python.
+    carried: The saved view as JSON, what of it holds for all cases; it is drawn by `drawer`, a function ("module:name")
+        that is called as `draw_carried`.
     """
 
     output: str
@@ -204,6 +216,8 @@ class Plan:
     options: Mapping[str, str] | None = None
     timeout: float
     no_clobber: bool = False
+    drawer: str | None = None
+    carried: str | None = None
 
     def to_json(self) -> str:
         return json.dumps(asdict(self), default=os.fspath)
@@ -257,7 +271,7 @@ def make_key(case: Case, plan: Plan) -> str:
     values = {own.name: getattr(settings, own.name) for own in fields(settings) if own.name not in _ANY_MACHINE}
     labels = None if settings.labels is None else replace(settings.labels, path="")
     outputs = [getattr(plan.batch, name) for name in ("format", "mesh", "measure", "cloud", "picture", "views")]
-    asked = (_FORMAT, package_version(), values, labels, outputs)
+    asked = (_FORMAT, package_version(), values, labels, outputs, *filter(None, [plan.carried]))
     digest = hashlib.sha256(repr(asked).encode("utf-8", "replace"))
     for path in filter(None, (case.source, case.labels)):
         remote = open_remote(path).list_entries() if is_url(path) else None

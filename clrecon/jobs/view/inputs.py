@@ -50,6 +50,8 @@ def check_view_settings(settings: ViewSettings) -> None:
         raise UsageError("a view begins with one iso value: give one, and move the slider")
 
 
+Reader = Callable[..., Volume]
+
 _MOST_LABELS = 1000
 """Values up to which whole numbers from 0 are taken for labels; air of a CT is negative."""
 
@@ -72,8 +74,12 @@ def open_inputs(
     *,
     progress: Progress | None = None,
     ready: Callable[[OpenedInput], None] | None = None,
+    read: Reader = read_selected,
 ) -> list[OpenedInput]:
-    """Read the inputs of a view, the label map of its settings last; `ready` gets each input as soon as it is read."""
+    """Read the inputs of a view, the label map of its settings last; `ready` gets each input as soon as it is read.
+
+    read: Of scans, with the arguments of `read_selected`.
+    """
     settings, tell = settings or ViewSettings(), progress or ignore_progress
     labels = settings.scan.labels
     if not inputs and labels is None:
@@ -84,7 +90,7 @@ def open_inputs(
     readers: dict[str, Callable[[str | Path], OpenedInput]] = {
         "mesh": partial(_open_mesh, space=settings.mesh_space),
         "cloud": partial(_open_cloud, space=settings.mesh_space),
-        "scan": partial(_open_scan, settings=settings, progress=tell),
+        "scan": partial(_open_scan, settings=settings, progress=tell, read=read),
     }
     by_position: dict[int, OpenedInput] = {}
     for position in sorted(range(len(inputs)), key=lambda place: kinds[place] == "scan"):
@@ -146,7 +152,7 @@ def _open_cloud(path: str | Path, space: Space | None) -> OpenedInput:
     return OpenedInput(cloud, (*_describe_frame(name, file), *notes), dict(file))
 
 
-def _open_scan(path: str | Path, settings: ViewSettings, progress: Progress) -> OpenedInput:
+def _open_scan(path: str | Path, settings: ViewSettings, progress: Progress, read: Reader) -> OpenedInput:
     """Read a scan, and mask and crop it; a file of whole numbers from 0 is a label map."""
     from clrecon.labels.reader import is_dicom_map
 
@@ -154,7 +160,7 @@ def _open_scan(path: str | Path, settings: ViewSettings, progress: Progress) -> 
     if tell_format(path) is None and is_dicom_map(path):
         labels = _read_labels(path)
         return OpenedInput(labels, labels.warnings)
-    volume = read_selected(path, scan, progress=progress)
+    volume = read(path, scan, progress=progress)
     if tell_format(path) is not None and _holds_labels(volume):
         labels = _read_labels(path)
         note = f"{name} is taken for a label map: its values are whole numbers from 0"

@@ -31,11 +31,15 @@ _FIT_PIXELS = 1000
 
 
 def fit_camera(
-    points: Float64Array, view: DirectionName | Sequence[float], aspect: float, view_angle: float | None = None
+    points: Float64Array,
+    view: DirectionName | Sequence[float],
+    aspect: float,
+    view_angle: float | None = None,
+    **up: Any,
 ) -> Camera:
     """Return a camera from a side of the patient so that points (n, 3) fit; `aspect` is width by height."""
     size = (max(1, round(aspect * _FIT_PIXELS)), _FIT_PIXELS)
-    return Camera.fit(box_around([points]), view, view_angle=view_angle, size=size)
+    return Camera.fit(box_around([points]), view, view_angle=view_angle, size=size, **up)
 
 
 _TURN_DEGREES = 180.0
@@ -169,6 +173,13 @@ class ChangingView:
 
     def _fitted(self, view: DirectionName | Sequence[float]) -> Camera:
         return fit_camera(self._shown_corners(), view, self.aspect, self.camera.view_angle)
+
+    def fit_shown(self) -> None:
+        """Look along the camera's own direction, so that what is shown fits."""
+        x, y, z = (-self.camera.basis().forward).tolist()
+        angles = math.degrees(math.atan2(x, -y)), math.degrees(math.atan2(z, math.hypot(x, y)))
+        corners, up = self._shown_corners(), self.camera.up
+        self._change("look", "the view", camera=fit_camera(corners, angles, self.aspect, self.camera.view_angle, up=up))
 
     def set_perspective(self, on: bool) -> None:
         """Take a perspective camera, or a parallel one, with the same size at the focal point."""

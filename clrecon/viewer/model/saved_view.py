@@ -102,6 +102,38 @@ def read_view(path: str | Path) -> dict[str, Any]:
     return saved
 
 
+def carry_view(saved: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what of a saved view of one scan, alone or with a label map, holds for scans of other patients too.
+
+    HU, directions, shares, and the looks of the scan and its labels stay.  Components and all that lies at a place go.
+    """
+    try:
+        if saved["objects"] not in (["scan"], ["scan", "labels"]):
+            raise RefusedInputError(
+                f"the saved view is of {_say_kinds(saved['objects'])}: scans of other patients are shown by a view of"
+                " one scan, with or without a label map"
+            )
+        looks = [each for each in saved["parts"] if each["kind"] not in ("cluster", "rest")]
+    except (KeyError, TypeError) as error:
+        raise RefusedInputError(f"the saved view is damaged: {escape_text(str(error), 120)}") from None
+    of_one_patient: dict[str, Any] = {
+        "turn": None,
+        "compare": None,
+        "slices": [],
+        "measures": [],
+        "clip_box_lps_mm": None,
+    }
+    return {**saved, **of_one_patient, "parts": looks}
+
+
+def restore_elsewhere(carried: Mapping[str, Any], model: ViewModel) -> None:
+    """Show another scan by a view of `carry_view`, from the same direction, framed anew."""
+    keys = {part.key for part in first_parts(model.objects)}  # a label may be missing
+    looks = [each for each in carried["parts"] if each["key"] in keys]
+    restore_view({**carried, "cross_lps_mm": model.state.cross, "parts": looks}, model)
+    model.fit_shown()
+
+
 def restore_view(saved: Mapping[str, Any], model: ViewModel) -> None:
     """Show what a saved view of the same inputs describes, as one step of undo; clusters are still to be found.
     A view of other inputs is a `RefusedInputError`, and so is an entry that is missing or makes no sense.

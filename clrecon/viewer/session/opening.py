@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 from clrecon.errors import RefusedInputError
-from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.jobs.mesh.surfaces import choose_level
 from clrecon.jobs.view import ViewSettings
-from clrecon.jobs.view.inputs import check_view_settings, open_inputs
+from clrecon.jobs.view.inputs import Reader, check_view_settings, open_inputs
 from clrecon.rendering.pictures.picture import check_image_path
 from clrecon.rendering.pictures.pillow import load_pillow
 from clrecon.system.base_classes import Closing
 from clrecon.system.files import check_writable
+from clrecon.system.light_dataclass import replace
 from clrecon.system.paths import keep_existing
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.viewer.drawing.painter import Painter
@@ -23,7 +26,7 @@ from clrecon.viewer.drawing.saving import save_shown
 from clrecon.viewer.drawing.shown_meshes import shows_fits
 from clrecon.viewer.model.model import ViewModel
 from clrecon.viewer.model.objects import ShownObject, ShownScan, wrap_inputs
-from clrecon.viewer.model.saved_view import read_view, restore_view
+from clrecon.viewer.model.saved_view import read_view, restore_elsewhere, restore_view
 from clrecon.viewer.session.session import ViewSession
 
 
@@ -44,9 +47,19 @@ def choose_iso(objects: Sequence[ShownObject], scan: MeshSettings, progress: Pro
 
 
 class OpenedView(Closing):
-    """What the views of some objects share, and what has to be `said` of them; a context manager."""
+    """What the views of some objects share, and what has to be `said` of them; a context manager.
 
-    def __init__(self, objects: Sequence[ShownObject], settings: ViewSettings, progress: Progress = ignore_progress):
+    carried: A view of other objects that the model shows, see `carry_view`.
+    """
+
+    def __init__(
+        self,
+        objects: Sequence[ShownObject],
+        settings: ViewSettings,
+        progress: Progress = ignore_progress,
+        *,
+        carried: Mapping[str, Any] | None = None,
+    ):
         scan = settings.scan
         self.objects = list(objects)
         self.said = list(dict.fromkeys(chain(*(each.said for each in self.objects))))
@@ -54,7 +67,8 @@ class OpenedView(Closing):
         self._space, self._keep_ids = scan.space, scan.keep_ids
         self._progress = progress
         self._fitted = scan.surface == "cortex" and any(isinstance(each, ShownScan) for each in self.objects)
-        self._saved = None if settings.state is None else read_view(settings.state)
+        self._saved = carried if settings.state is None else read_view(settings.state)
+        self._carried = carried
         self.painter = Painter(self.objects, device=scan.device, memory=scan.memory)
         self._begins_with_bone = (
             self._saved is None
@@ -94,7 +108,10 @@ class OpenedView(Closing):
         """Return what a view begins with, with the table taken away where the saved view says so."""
         model = ViewModel(self.objects, space=self._space, iso_value=self._iso_value)
         model.set_aspect(aspect)
-        if self._saved is not None:
+        if self._carried is not None:
+            bare = self._carried.get("table_shown") is False and self._take_table(self._progress)
+            restore_elsewhere({**self._carried, "table_shown": not bare}, model)
+        elif self._saved is not None:
             if model.scans and self._saved.get("table_shown") is False:
                 self.painter.remove_table(self._progress)
             restore_view(self._saved, model)
@@ -133,10 +150,44 @@ def draw_view(
     with keep_existing(keep=no_clobber):
         check_writable(output)
     with open_view(inputs, settings, progress=progress) as view:
-        model, painter = view.model(size[0] / size[1]), view.painter
-        if any(each.kind in ("cluster", "rest") and not each.is_plain for each in model.state.parts):
-            model.take_parts(painter.find_parts(model.state, progress))
-        if shows_fits(model.state):
-            painter.fit_scans(model.state, progress)
-        lines = save_shown(output, painter, model.state, size=size, no_clobber=no_clobber, progress=progress)
-        return view.said, lines
+        return view.said, _draw_opened(view, output, size, no_clobber=no_clobber, progress=progress)
+
+
+def draw_carried(
+    source: str,
+    labels: str | None,
+    scan: MeshSettings,
+    output: Path,
+    *,
+    size: Sequence[int],
+    carried: str,
+    read: Reader,
+) -> list[str]:
+    """Draw a scan, with its label map if the view has one, as a view of another scan shows it; return warnings.
+
+    carried: JSON of `carry_view`.
+    read: See `open_inputs`.
+    """
+    saved = json.loads(carried)
+    choice = LabelChoice(labels) if labels is not None and "labels" in saved["objects"] else None
+    settings = ViewSettings(scan=replace(scan, labels=choice))
+    objects = wrap_inputs(open_inputs([source], settings, read=read), ())
+    with OpenedView(objects, settings, carried=saved) as view:
+        _draw_opened(view, output, size)
+        return view.said
+
+
+def _draw_opened(
+    view: OpenedView,
+    output: str | Path,
+    size: Sequence[int],
+    *,
+    no_clobber: bool = False,
+    progress: Progress = ignore_progress,
+) -> list[str]:
+    model, painter = view.model(size[0] / size[1]), view.painter
+    if any(each.kind in ("cluster", "rest") and not each.is_plain for each in model.state.parts):
+        model.take_parts(painter.find_parts(model.state, progress))
+    if shows_fits(model.state):
+        painter.fit_scans(model.state, progress)
+    return save_shown(output, painter, model.state, size=size, no_clobber=no_clobber, progress=progress)
