@@ -3,9 +3,10 @@
 
     python scripts/package/set_version.py 0.2.0
 
-setup.cfg, CITATION.cff and scripts/package/recipe.yaml get the version; in CHANGELOG.md the title "Unreleased" becomes
-the version with the date of today, and a new empty "Unreleased" stands above it.  A version that is not higher, a file
-without a version and a changelog without entries are refused, and nothing is written then.
+setup.cfg, CITATION.cff and scripts/package/recipe.yaml get the version, CITATION.cff the date of today too; in
+CHANGELOG.md the title "Unreleased" becomes the version with that date, and a new empty "Unreleased" stands above it.  A
+version that is not higher, a file without a version and a changelog without entries are refused, and nothing is written
+then.
 """
 
 from __future__ import annotations
@@ -39,6 +40,8 @@ def set_version(root: Path, version: str, date: str) -> None:
         if _numbers(version) <= _numbers(stated[0]):
             raise ValueError(f"{name} has version {stated[0]}: {version} is not higher")
         texts[name] = re.sub(pattern, lambda found: found[0].replace(found[1], version), text)
+    undated = re.sub(r"(?m)^date-released: .*\n", "", texts["CITATION.cff"])
+    texts["CITATION.cff"] = undated.replace(f"\nversion: {version}\n", f"\nversion: {version}\ndate-released: {date}\n")
     changes = (root / "CHANGELOG.md").read_text(encoding="utf-8")
     if changes.count(TITLE) != 1 or changes.partition(TITLE)[2].lstrip().startswith("## "):
         raise ValueError('CHANGELOG.md has no entries below one title "Unreleased"')
