@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from isal import isal_zlib
 from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
@@ -34,7 +35,6 @@ from clrecon.exchange.page_slices import PackedSlices, describe_slices
 from clrecon.exchange.raw_content import join_numbers
 from clrecon.system.color_scale import ColorScale
 from clrecon.system.light_dataclass import dataclass
-from clrecon.system.packing import GZIP, find_deflate, start_packing
 from clrecon.system.pieces import find_bounds, side_by_side
 from clrecon.system.text import to_hexadecimal
 from clrecon.version import package_version
@@ -43,8 +43,10 @@ STEPS = 65_535
 """Steps of a coordinate along a side of the bounding box; of a number at a vertex this one means that none is known."""
 
 NORMAL_SCALE = 127.0
-_LEVEL = 4
-"""Of zlib: 6 takes twice as long, for files 2.5 % smaller."""
+_LEVEL = 2
+"""Of ISA-L, 0 to 3: an eighth of the time of level 4 of zlib, for files 4 % larger."""
+
+_GZIP = 16 + isal_zlib.MAX_WBITS
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +83,7 @@ def encode_surface(
     places = vertices[order].astype(np.float64)
     low, high = find_bounds(places)
     step = (high - low) / STEPS
-    packer = start_packing(_LEVEL, GZIP)
+    packer = isal_zlib.compressobj(_LEVEL, wbits=_GZIP)
 
     def pack_vertices() -> bytes:
         scaled = (places - low) / np.where(step > 0.0, step, 1.0)
@@ -103,10 +105,9 @@ def encode_surface(
 
 
 def unpack_planes(coded: CodedSurface) -> NDArray[np.uint8]:
-    deflate = find_deflate()
     try:
-        data = np.frombuffer(deflate.decompress(coded.data, GZIP), np.uint8)
-    except deflate.error as error:
+        data = np.frombuffer(isal_zlib.decompress(coded.data, _GZIP), np.uint8)
+    except isal_zlib.error as error:  # type: ignore[misc]
         raise ValueError(f"the data of the surface cannot be unpacked: {error}") from error
     expected = (9 + 2 * coded.columns) * coded.vertices + 12 * coded.triangles
     if len(data) != expected:

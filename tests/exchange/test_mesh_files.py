@@ -7,21 +7,18 @@ import errno
 import io
 import json
 import struct
-import sys
 import zipfile
 
 import numpy as np
 import pytest
 import sample_meshes as samples
 import tolerances
-from coded_pages import decode_surface
 from full_disk import FullDisk
 from refusals import refused
 
 from clrecon.errors import NoSurfaceError, OutputError, UsageError
 from clrecon.exchange import formats as writers
 from clrecon.exchange.formats import FORMATS
-from clrecon.exchange.page import parse_page
 from clrecon.mesh import Mesh
 
 pytestmark = pytest.mark.unit
@@ -405,25 +402,6 @@ def test_mesh_with_an_index_beyond_its_vertices_is_refused_and_nothing_is_writte
     with refused(UsageError, 9, "vertex"):
         Mesh(np.eye(3), [[0, 1, 9]]).save(tmp_path / "bone.vtp")
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("extension", [".3mf", ".html"])
-def test_mesh_packed_by_isal_is_unpacked_by_zlib_as_that_which_zlib_packed(mesh, extension, tmp_path, monkeypatch):
-    pytest.importorskip("isal")
-    files = [tmp_path / f"{library}{extension}" for library in ("isal", "zlib")]
-    mesh.save(files[0])
-    monkeypatch.setitem(sys.modules, "isal.isal_zlib", None)
-    mesh.save(files[1])
-    by_isal, by_zlib = (path.read_bytes() for path in files)
-    assert by_isal != by_zlib  # both were used
-    if extension == ".3mf":
-        by_isal, by_zlib = (zipfile.ZipFile(path).read("3D/3dmodel.model") for path in files)
-        assert by_isal == by_zlib
-    else:
-        for unpacked, expected in zip(
-            *(decode_surface(parse_page(page)[1]) for page in (by_isal, by_zlib)), strict=True
-        ):
-            np.testing.assert_array_equal(unpacked, expected)
 
 
 @pytest.mark.faults

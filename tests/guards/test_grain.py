@@ -12,8 +12,8 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 101_613,
-    "modules": 441,
+    "lines": 101_585,
+    "modules": 440,
     "small_modules_with_one_reader": 7,
     "docstrings_with_raises": 139,
     "options_in_several_files": 9,

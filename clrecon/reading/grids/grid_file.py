@@ -6,9 +6,7 @@ size is compared with the bytes that are there before memory is taken, and voxel
 
 from __future__ import annotations
 
-import gzip
 import io
-import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from math import prod
@@ -16,6 +14,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any, BinaryIO, Protocol, cast
 
 import numpy as np
+from isal import igzip, isal_zlib
 from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError
@@ -43,6 +42,7 @@ _LARGEST_SURPLUS = 4096
 """Most bytes that may follow the last number: some writers fill up a block."""
 
 _CHUNK = 2**18
+_UNPACKING_ERRORS: tuple[type[Exception], ...] = (EOFError, OSError, isal_zlib.error)  # type: ignore[assignment]
 
 
 class VoxelSource(Protocol):
@@ -100,11 +100,16 @@ class VoxelBytes:
             file.seek(self.offset)
             stream: BinaryIO = file
             if self.packing == "gzip":
-                stream = cast(BinaryIO, gzip.GzipFile(fileobj=file))
+                stream = open_gzip(file)
             elif self.packing == "zlib":
                 stream = cast(BinaryIO, ZlibFile(file))
             read_bytes(stream, self.skip, name, "its header")
             yield stream
+
+
+def open_gzip(file: BinaryIO) -> BinaryIO:
+    """Return the inflated bytes of a gzip file, to read.  ISA-L inflates scans in half of zlib's time."""
+    return cast(BinaryIO, igzip.IGzipFile(fileobj=file))
 
 
 class ZlibFile(io.RawIOBase):
@@ -112,7 +117,7 @@ class ZlibFile(io.RawIOBase):
 
     def __init__(self, file: BinaryIO):
         super().__init__()
-        self._file, self._inflater = file, zlib.decompressobj()
+        self._file, self._inflater = file, isal_zlib.decompressobj()
 
     def readable(self) -> bool:
         return True
@@ -162,7 +167,7 @@ def read_bytes(stream: BinaryIO, count: int, name: str, section: str) -> bytes:
                 raise RefusedInputError(f"{name} is cut: it ends in {section}, {missing:,} bytes before its end")
             parts.append(part)
             missing -= len(part)
-    except (EOFError, zlib.error, OSError) as error:
+    except _UNPACKING_ERRORS as error:
         raise RefusedInputError(f"{name} is cut or corrupt in {section}: {escape_text(str(error))}") from error
     return parts[0] if len(parts) == 1 else b"".join(parts)
 
@@ -175,7 +180,7 @@ def check_end(stream: BinaryIO, name: str) -> None:
             surplus += len(part)
             if surplus > _LARGEST_SURPLUS:
                 raise RefusedInputError(f"{name} is corrupt: it holds more numbers than its header says")
-    except (EOFError, zlib.error, OSError) as error:
+    except _UNPACKING_ERRORS as error:
         raise RefusedInputError(f"{name} is cut or corrupt at its end: {escape_text(str(error))}") from error
 
 

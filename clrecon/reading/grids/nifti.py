@@ -2,27 +2,27 @@
 
 from __future__ import annotations
 
-import gzip
 import math
 import re
-from importlib import import_module
+from io import BytesIO
 from itertools import product
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
 import numpy as np
+from isal import igzip_threaded
 
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry.affine import Float64Array, checked_affine, lps_affine_from_ras
 from clrecon.geometry.images import MM_PER_UNIT, place_in_header
 from clrecon.reading.grids.grid_file import (
-    PACKING,
     VOLUME,
     GridFile,
     VolumeContent,
     VoxelBytes,
     file_beside,
     import_extra,
+    open_gzip,
     read_bytes,
 )
 from clrecon.system.light_dataclass import dataclass
@@ -64,7 +64,7 @@ def open_nifti(path: Path, purpose: str) -> GridFile:
     name = escape_text(path.name)
     with open_regular(path) as file:
         compressed = _is_gzip(file)
-        header = _read_header(cast(BinaryIO, gzip.GzipFile(fileobj=file)) if compressed else file, name, purpose)
+        header = _read_header(open_gzip(file) if compressed else file, name, purpose)
     try:
         shape = _shape(header.parsed, name, purpose)
         dtype = _dtype(header.parsed, name, purpose)
@@ -219,21 +219,12 @@ def write_nifti(stream: BinaryIO, content: VolumeContent, *, packed: bool) -> No
     if not packed:
         _write_parts(stream, content)
         return
-    with _open_packer(stream) as packing:
+    with igzip_threaded.open(stream, "wb", compresslevel=_ISAL_LEVEL, threads=-1) as packing:  # a thread a core
         _write_parts(packing, content)
 
 
 _ISAL_LEVEL = 3
-"""Level of ISA-L: the file is 2 % smaller than that of zlib, and packed in a quarter of the time."""
-
-
-def _open_packer(stream: BinaryIO) -> Any:
-    """Return a file that packs by gzip into a stream: with ISA-L where the package isal is installed, else zlib."""
-    try:
-        igzip = import_module("isal.igzip")
-    except ImportError:
-        return gzip.GzipFile(filename="", mode="wb", compresslevel=PACKING, fileobj=stream, mtime=0)
-    return igzip.IGzipFile(filename="", mode="wb", compresslevel=_ISAL_LEVEL, fileobj=stream, mtime=0)
+"""Level of ISA-L: the file is 1 % smaller than that of level 1 of zlib, and packed in a quarter of the time."""
 
 
 def _write_parts(stream: Any, content: VolumeContent) -> None:
@@ -248,7 +239,9 @@ def _write_parts(stream: Any, content: VolumeContent) -> None:
     text = "\n".join(("clrecon", *content.lines)).encode("ascii")
     header.extensions.append(nibabel.nifti1.Nifti1Extension(_COMMENT_CODE, text))
     header["vox_offset"] = header.single_vox_offset + header.extensions.get_sizeondisk()
-    header.write_to(stream)
+    start = BytesIO()  # nibabel asks where it is, and a stream that packs does not know
+    header.write_to(start)
+    stream.write(start.getvalue())
     for k, layer in enumerate(content.voxels):
         stream.write(np.asarray(layer, dtype).tobytes())
         content.progress("write", k + 1, len(content.voxels))
