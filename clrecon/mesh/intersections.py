@@ -53,18 +53,23 @@ def find_self_intersections(
     """
     sound = np.isfinite(vertices).all(axis=1)
     if not sound.all():
-        rows = np.flatnonzero(sound[triangles].all(axis=1))
-        cut = find_self_intersections(
-            np.where(sound[:, None], vertices, 0.0), triangles[rows], None if changed is None else changed[rows]
-        )
-        return rows[cut]
+        vertices = np.where(sound[:, None], vertices, 0.0)
     if len(triangles) == 0:
         return np.zeros((0, 2), dtype=np.int64)
     columns = np.ascontiguousarray((vertices - local_origin(vertices)).T)
     corners = np.ascontiguousarray(triangles.T)
     points = [columns.take(corner, axis=1) for corner in corners]
-    entries = _enter(np.minimum.reduce(points), np.maximum.reduce(points))
     planes = _Planes.of(vertices, triangles, points)
+    has_area: NDArray[np.bool_] = planes.normal.any(axis=0)
+    flat = np.flatnonzero(~has_area)
+    has_area[flat] = _has_area(vertices[triangles[flat].T].astype(np.float64))
+    if not (sound.all() and has_area.all()):  # thousands at one place would all be paired
+        rows = np.flatnonzero(has_area & sound[triangles].all(axis=1))
+        changed = None if changed is None else changed[rows]
+        if steps is not None:
+            steps.take(len(triangles) - len(rows))
+        return rows[find_self_intersections(vertices, triangles[rows], changed, steps=steps)]
+    entries = _enter(np.minimum.reduce(points), np.maximum.reduce(points))
     pieces = entries.pieces()
     close = [np.zeros((0, 2), dtype=np.int64)] * (len(pieces) - 1)
 

@@ -11,6 +11,7 @@ from variants import daily
 
 from clrecon.mesh import Mesh, intersections
 from clrecon.mesh.intersections import find_beside, find_changed_intersections, find_self_intersections
+from clrecon.system.progress import Steps
 
 pytestmark = pytest.mark.unit
 
@@ -287,6 +288,19 @@ def test_a_mesh_without_finite_vertices_has_no_pairs():
 )
 def test_triangles_that_are_points_cut_nothing(vertices, triangles):
     assert count_pairs((vertices, triangles)) == 0
+
+
+@pytest.mark.parametrize(
+    "direction", [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.5, 1.0, -2.0)], ids=["point", "x", "oblique"]
+)
+def test_no_pairs_are_looked_at_of_thousands_of_triangles_without_area_at_one_place(direction):
+    """2,000 boxes that overlap are 2 million pairs: 31 pieces of 65,536, each of which is told."""
+    steps_told = []
+    corners = np.array([0.0, 1.0, 3.0])[:, None] * np.array(direction)
+    triangles = np.arange(6000, dtype=np.uint32).reshape(-1, 3)
+    steps = Steps(lambda *step: steps_told.append(step), "crossings", len(triangles))
+    assert len(find_self_intersections(np.tile(corners, (2000, 1)), triangles, steps=steps)) == 0
+    assert [done for _, done, _ in steps_told] == [0, len(triangles)]
 
 
 def row_of_triangles(axis: int) -> tuple[np.ndarray, np.ndarray]:
