@@ -19,7 +19,7 @@ from clrecon.proof.compare.processes import Request, load_volume, save_arrays, s
 from clrecon.system.processes import end_process
 from clrecon.system.progress import time_limit
 
-LONG_SECONDS = 2.0
+LONG_SECONDS = 1.0
 """No further warm run begins after so many seconds of them."""
 
 

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from clrecon.errors import ClreconError
 from clrecon.geometry import Volume
-from clrecon.mesh import Mesh
 from clrecon.operators.rays.mesh_pictures import box_around
 from clrecon.proof.compare.findings import SAME_MM, MethodRecord
 from clrecon.proof.compare.methods import COMPARED
@@ -81,12 +80,11 @@ def inside_box(volume: Volume, iso_value: float) -> NDArray[np.float64]:
     return np.array([[float(each[0]) for each in places], [float(each[-1]) for each in places]])
 
 
-def cut_mesh(mesh: Mesh, volume: Volume, plane: Plane) -> Segments:
-    ijk = volume.lps_to_ijk(mesh.vertices)
+def cut_triangles(ijk: NDArray[np.float64], triangles: NDArray[np.uint32], plane: Plane) -> Segments:
     height = ijk[:, plane.axis] - plane.at
-    above = height[mesh.triangles] > 0.0
-    crossing = above.any(axis=1) & ~above.all(axis=1)
-    corners, above = mesh.triangles[crossing], above[crossing]
+    above = (height > 0.0)[triangles]
+    crossing = np.flatnonzero(above.any(axis=1) & ~above.all(axis=1))
+    corners, above = triangles[crossing], above[crossing]
     # The lone corner of each triangle is the one whose two edges are cut.
     lone = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1))
     rows = np.arange(len(corners))
@@ -386,8 +384,9 @@ def collect_figures(figures: Figures, records: Sequence[MethodRecord]) -> None:
             figures.views[name] = figures.images[name] = view
         mesh = load_mesh(figures.work, name)
         if mesh is not None:
+            ijk = figures.volume.lps_to_ijk(mesh.vertices)
             for plane, contours in zip(figures.planes, figures.contours, strict=True):
-                contours[name] = cut_mesh(mesh, figures.volume, plane)
+                contours[name] = cut_triangles(ijk, mesh.triangles, plane)
     reference = figures.views.get(figures.reference)
     for name, view in figures.views.items():
         if reference is not None and name != figures.reference and view.shape == reference.shape:
@@ -402,4 +401,4 @@ def collect_figures(figures: Figures, records: Sequence[MethodRecord]) -> None:
 
 def draw_figures(figures: Figures, folder: Path) -> None:
     for name, image in figures.images.items():
-        _as_pillow(image).save(folder / f"{name}.png", "PNG", optimize=True)
+        _as_pillow(image).save(folder / f"{name}.png", "PNG")

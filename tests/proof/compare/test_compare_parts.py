@@ -18,7 +18,7 @@ from clrecon.proof.compare.figures import (
     COLORS,
     Plane,
     along_slices,
-    cut_mesh,
+    cut_triangles,
     difference_of,
     find_planes,
     middle_slice,
@@ -65,7 +65,8 @@ def surface_of(volume: Volume, device: Any = None) -> Mesh:
 def test_cut_of_a_ball_is_one_closed_circle(device: Any) -> None:
     volume = make_ball()
     plane = Plane("", axis=2, at=14.2 + 4.0, across=0, down=1, flip=False)
-    lines = cut_mesh(surface_of(volume, device), volume, plane)
+    mesh = surface_of(volume, device)
+    lines = cut_triangles(volume.lps_to_ijk(mesh.vertices), mesh.triangles, plane)
     radius = np.hypot(*(lines.reshape(-1, 2) - [15.7, 15.1]).T)
     np.testing.assert_allclose(radius, np.sqrt(RADIUS**2 - 4.0**2), atol=0.05)  # voxels
     ends, many = np.unique(np.round(lines.reshape(-1, 2), 3), axis=0, return_counts=True)
