@@ -125,7 +125,7 @@ def count_leftovers(output: str | Path, paths: Sequence[str | Path]) -> int:
 
 def refuse_files(paths: Sequence[str | Path]) -> None:
     """Raise `OutputError` if one of the files exists."""
-    with keep_existing():
+    with keep_existing(keep=True):
         for path in paths:
             refuse_existing(path, resolve_target(path))
 

@@ -97,8 +97,8 @@ _KINDS: tuple[tuple[Callable[[int], bool], str], ...] = (
 
 
 @contextlib.contextmanager
-def keep_existing(*, keep: bool = True) -> Iterator[None]:
-    """In the ``with`` block, refuse every target that exists; with False, replace it, which is the default."""
+def keep_existing(*, keep: bool) -> Iterator[None]:
+    """In the ``with`` block, refuse every target that exists or, with False, replace it, as outside of such blocks."""
     token = _existing_stay.set(keep)
     try:
         yield

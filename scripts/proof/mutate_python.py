@@ -52,7 +52,11 @@ ROOM_TESTS = {
     "geometry": ("tests/jobs/test_cropping.py",),
     "exchange": ("tests/points/test_reader.py", "tests/mesh/test_mesh_reader.py"),
     "jobs": ("tests/cli/test_info.py",),
-    "system": ("tests/cli/test_foreign_words.py", "tests/guards/test_wrong_arguments.py"),
+    "system": (
+        *("tests/cli/test_foreign_words.py", "tests/guards/test_wrong_arguments.py"),
+        "tests/rendering/looks/test_color_scale.py",
+    ),
+    "anatomy": ("tests/operators/rays/test_smooth_light.py",),
     "cli": ("tests/jobs/test_inside_job.py", "tests/jobs/test_stats_job.py", "tests/proof/compare/test_compare_job.py"),
 }
 """Further tests of a room: those of the only code that uses a part of it, which ask this part too."""

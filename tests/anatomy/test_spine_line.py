@@ -254,6 +254,7 @@ def test_only_the_sure_part_of_a_line_is_returned_on_request(cropped_scan):
     sure, whole = find_spine_line(cropped_scan, sure_only=True), find_spine_line(cropped_scan)
     assert sure.height_mm < 0.75 * whole.height_mm  # 28 of 60 slices are whole; measured 60 of 144 mm
     assert sure.ends == {"upper": None, "lower": None}
+    assert sure.sure_mm == pytest.approx(sure.points[[0, -1], 2], abs=CELL_MM[2])
 
 
 def line_above_lost_slices(phantom, *, hu):

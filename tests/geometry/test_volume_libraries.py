@@ -346,6 +346,19 @@ def test_an_image_of_pyvista_in_ras_becomes_a_volume_in_lps(image_in_ras, named_
     assert np.abs(volume.affine - AFFINES["oblique"]).max() <= tolerances.FLOAT64_PLACE_MM
 
 
+def test_a_plain_image_of_vtk_becomes_the_volume_that_its_copy_in_pyvista_becomes():
+    from vtkmodules.vtkCommonDataModel import vtkImageData
+
+    volume = numbered_volume(AFFINES["oblique"])
+    plain = vtkImageData()
+    plain.DeepCopy(volume.to_pyvista())
+
+    back = Volume.from_pyvista(plain)
+
+    assert np.array_equal(back.voxels, volume.voxels)
+    assert np.abs(back.affine - volume.affine).max() <= tolerances.FLOAT64_PLACE_MM
+
+
 def test_an_image_of_pyvista_whose_frame_contradicts_the_caller_is_refused(image_in_ras):
     image_in_ras.field_data["SPACE"] = ["RAS"]
     with refused(UsageError, "RAS", "LPS"):

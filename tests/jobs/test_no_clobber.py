@@ -130,7 +130,7 @@ def file_system(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch)
 def test_file_that_comes_before_the_last_step_stays_with_no_clobber(tmp_path: Path) -> None:
     target = tmp_path / "a.stl"
 
-    with keep_existing(), stage_file(target, lambda stream: stream.write(b"new")) as staged:
+    with keep_existing(keep=True), stage_file(target, lambda stream: stream.write(b"new")) as staged:
         target.write_bytes(b"came meanwhile")
         with refused(OutputError, "a.stl", "no_clobber=True"):
             staged.commit()
@@ -144,7 +144,7 @@ def test_file_that_comes_before_the_last_step_stays_with_no_clobber(tmp_path: Pa
 def test_new_file_is_written_with_no_clobber(tmp_path: Path) -> None:
     target = tmp_path / "a.stl"
 
-    with keep_existing():
+    with keep_existing(keep=True):
         bytes_written = replace_file(target, lambda stream: stream.write(b"new"))
 
     assert bytes_written == len(b"new")
@@ -154,7 +154,7 @@ def test_new_file_is_written_with_no_clobber(tmp_path: Path) -> None:
 
 @pytest.mark.fault_row(63)
 def test_frames_that_come_before_the_last_step_stay_with_no_clobber(tmp_path: Path) -> None:
-    with keep_existing(), stage_animation(FRAMES, tmp_path / "turn") as staged:
+    with keep_existing(keep=True), stage_animation(FRAMES, tmp_path / "turn") as staged:
         write_animation(FRAMES[:1], tmp_path / "turn")
         with refused(OutputError, "turn", "no_clobber=True"):
             staged.commit()
@@ -170,7 +170,7 @@ def test_one_of_many_writers_at_once_writes_with_no_clobber(tmp_path: Path) -> N
     together = threading.Barrier(8)
 
     def write(number: int) -> None:
-        with keep_existing(), stage_file(target, lambda stream: stream.write(b"%d" % number)) as staged:
+        with keep_existing(keep=True), stage_file(target, lambda stream: stream.write(b"%d" % number)) as staged:
             together.wait()
             try:
                 staged.commit()
@@ -224,5 +224,5 @@ def test_output_with_numbered_files_is_refused_only_with_no_clobber(tmp_path: Pa
     (tmp_path / "bone_001.stl").write_bytes(b"")
 
     refuse_numbered(tmp_path / "bone.stl")
-    with keep_existing(), refused(OutputError, "bone.stl", "no_clobber=True", 1):  # one file
+    with keep_existing(keep=True), refused(OutputError, "bone.stl", "no_clobber=True", 1):  # one file
         refuse_numbered(tmp_path / "bone.stl")

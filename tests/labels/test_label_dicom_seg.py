@@ -336,8 +336,8 @@ def test_frames_of_a_label_map_that_give_voxels_two_segments_are_refused(tmp_pat
         return [(2 * (pixels == 1).astype(np.uint8), group) for pixels, group in frames if (pixels == 1).any()]
 
     edit_frames(path, lambda frames: [*frames, *repeat_segment_1_as_2(frames)])
-    # T12 has 3 x 5 voxels in a slice.
-    words = "two of its frames lie at one place, slice . of 5, and give 15 voxels two segments, 1 and 2$"
+    # T12 has 3 x 5 voxels in slices 1 and 2 of the five that are not empty; the file begins with the last slice.
+    words = "two of its frames lie at one place, slice 2 of 5, and give 15 voxels two segments, 1 and 2$"
     with pytest.raises(RefusedInputError, match=words):
         read_labels(path)
 

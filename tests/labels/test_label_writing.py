@@ -113,6 +113,12 @@ def test_labels_encoded_twice_give_the_same_bytes_of_a_segmentation(scan):
     assert encode_segmentation(labels, slices) == encode_segmentation(labels, slices)
 
 
+@pytest.mark.parametrize("scan", ["oblique"], indirect=True)
+def test_written_segmentation_has_one_bit_for_each_pixel(scan, tmp_path):
+    segmentation = pydicom.dcmread(write_segmentation(tmp_path / "a.dcm", make_labels_on(read_volume(scan)), scan))
+    assert (segmentation.BitsAllocated, segmentation.BitsStored, segmentation.HighBit) == (1, 1, 0)
+
+
 def test_written_segmentation_references_study_frame_and_series_of_its_scan(scan, tmp_path):
     labels = make_labels_on(read_volume(scan))
     segmentation = pydicom.dcmread(write_segmentation(tmp_path / "a.dcm", labels, scan))

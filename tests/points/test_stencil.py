@@ -118,6 +118,15 @@ def test_slices_with_the_same_neighbours_share_a_table() -> None:
     assert len({tuple(table) for table in tables}) == 4  # of slices 0, 1 to 3, 4 and 5
 
 
+@pytest.mark.parametrize(("eps", "joins"), [(0.5, False), (1.0, True)])
+def test_columns_are_joined_by_neighbours_in_their_row_and_not_in_the_next_slice(eps: float, joins: bool) -> None:
+    """Each slice begins a voxel further right and 0.1 mm higher: the next slice has a neighbour in the next column."""
+    sheared = np.array([[1.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.1, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    stencil = make_stencil(Lattice((3, 3, 3), sheared), eps)
+    assert (1, 0, -1) in offsets_of(stencil, 1)
+    assert stencil.joins_columns == joins
+
+
 def test_rows_of_a_stencil_are_sorted_by_the_distance_of_their_middle() -> None:
     dj, dk, low, high = make_stencil(Lattice((30, 30, 30), THORACIC), eps=3.0).rows.T
     middles = np.stack([(low + high) / 2, dj, dk], axis=1) * np.diag(THORACIC)[:3]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from clrecon.system import pieces
-from clrecon.system.pieces import deal_in_order, list_distinct, side_by_side, sort_with_rows
+from clrecon.system.pieces import deal_in_order, list_distinct, side_by_side, sort_with_rows, spread_rows
 
 pytestmark = pytest.mark.unit
 
@@ -18,6 +18,13 @@ def test_keys_sorted_with_their_rows_keep_the_order_of_equal_ones():
     ordered, rows = sort_with_rows(upper.astype(np.uint64) << np.uint64(10))  # 10 bits: of rows up to 999
     assert np.array_equal(rows, np.argsort(upper, kind="stable"))
     assert np.array_equal(ordered, upper[rows])
+
+
+@pytest.mark.parametrize(
+    ("count", "most", "rows"), [(10, 4, [0, 3, 6, 9]), (3, 4, [0, 1, 2]), (0, 4, [])], ids=["some", "all", "none"]
+)
+def test_spread_rows_begin_with_the_first_and_end_with_the_last(count, most, rows):
+    assert spread_rows(count, most).tolist() == rows
 
 
 def test_two_functions_run_at_the_same_time():

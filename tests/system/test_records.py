@@ -20,7 +20,7 @@ from clrecon.labels.statistics import LabelFigures
 from clrecon.mesh.quality import MeshQuality
 from clrecon.reading.common.source_facts import SeriesEntry, SeriesListing
 from clrecon.spine.split import Vertebra, VertebraSplit
-from clrecon.system.records import Gate, Record, at_most
+from clrecon.system.records import Gate, Record, at_most, describe_volume
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,3 +201,10 @@ def test_repr_of_a_record_of_many_fields_is_one_line_of_less_than_120_characters
 def test_repr_of_a_listing_of_series_has_its_counts_alone() -> None:
     listing = SeriesListing(["x" * 999] * 3, chosen=2, skipped={}, warnings=[])
     assert repr(listing) == "SeriesListing(3 series, chosen=2, 0 warnings)"
+
+
+@pytest.mark.parametrize(
+    ("tilt_deg", "words"), [(0.04, ""), (-0.05, ", tilt -0.05 degrees")], ids=["rounding of headers", "tilt"]
+)
+def test_volume_is_described_with_its_tilt_from_a_twentieth_of_a_degree_on(tilt_deg: float, words: str) -> None:
+    assert describe_volume({"shape_ijk": [4, 3, 2], "tilt_deg": tilt_deg}) == f"2 slices of 4 x 3{words}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from clrecon.system.text import format_digits, format_hu
+from clrecon.system.text import escape_character, format_digits, format_hu, guess_word
 
 
 @pytest.mark.parametrize(
@@ -25,3 +25,17 @@ def test_number_is_written_with_grouped_digits_and_no_exponent_unless_it_is_huge
 )
 def test_hu_are_written_whole_or_with_three_significant_digits(value, text):
     assert format_hu(value) == text
+
+
+@pytest.mark.parametrize(
+    ("character", "code"),
+    [("\udcc3", "\\xc3"), ("\u202e", "\\u202e"), ("\0", "\\x00")],
+    ids=["byte of a name", "turns text round", "nul"],
+)
+def test_character_that_is_not_printed_is_written_as_its_code(character, code):
+    assert escape_character(character) == code
+
+
+@pytest.mark.parametrize(("letters", "guess"), [(64, f" (did you mean {'b' * 63}?)"), (65, "")], ids=["64", "65"])
+def test_word_of_up_to_64_letters_is_compared_with_those_that_are_known(letters, guess):
+    assert guess_word("b" * letters, ["b" * 63]) == guess
