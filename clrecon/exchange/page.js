@@ -23,18 +23,26 @@
     const place = new Uint16Array(4 * n), normal = new Int8Array(4 * n), index = new Uint32Array(m);
     const unfold = (folded) => (folded >> 1) ^ -(folded & 1);
     for (let axis = 0; axis < 3; axis++) {
-      const low = axis * n, high = low + 3 * n, turned = low + 6 * n;
-      for (let i = 0, at = 0, along = 0; i < n; i++) {
+      const low = axis * n, high = low + 3 * n;
+      for (let i = 0, at = 0; i < n; i++) {
         place[4 * i + axis] = at = (at + unfold(planes[low + i] | (planes[high + i] << 8))) & 65535;
-        normal[4 * i + axis] = along += unfold(planes[turned + i]);
       }
     }
-    const first = 9 * n;
+    const byte = (value) => (value << 24) >> 24;
+    for (let i = 0, x = 0, y = 0; i < n; i++) {
+      x = byte(x + unfold(planes[6 * n + i])), y = byte(y + unfold(planes[7 * n + i]));
+      const z = 127 - Math.abs(x) - Math.abs(y), back = Math.max(-z, 0);
+      const right = x - Math.sign(x) * back, up = y - Math.sign(y) * back;
+      const scale = 127 / Math.sqrt(right * right + up * up + z * z);
+      normal[4 * i] = Math.round(scale * right), normal[4 * i + 1] = Math.round(scale * up);
+      normal[4 * i + 2] = Math.round(scale * z);
+    }
+    const lags = 8 * n, first = lags + m;
     for (let i = 0, next = 0; i < m; i++) {
-      const at = first + i;
+      const at = first + i, lag = planes[lags + i];
       const code = planes[at] | (planes[at + m] << 8) | (planes[at + 2 * m] << 16) | (planes[at + 3 * m] << 24);
-      index[i] = next - code;
-      if (code === 0) next++;
+      index[i] = (lag ? index[i - lag] : next) + unfold(code);
+      if (index[i] === next) next++;
     }
     const columns = (facts.values || []).map((_, column, all) => {
       const codes = new Uint16Array(n), low = first + 4 * m + column * n, high = low + all.length * n;

@@ -17,25 +17,43 @@ Float64Array = NDArray[np.float64]
 
 
 def decode_surface(coded: CodedSurface) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.uint32]]:
-    """Return vertices in mm, normals (not of unit length: as they were rounded) and triangles, as a page shows them."""
+    """Return vertices in mm, normals and triangles, as a page shows them."""
     data = unpack_planes(coded)
     n = coded.vertices
     positions = unfold(join_planes(data[: 6 * n], 3, np.uint16), np.uint16)
-    turned = unfold(join_planes(data[6 * n : 9 * n], 3, np.uint8), np.uint8).view(np.int8)
-    codes = join_planes(data[9 * n : 9 * n + 12 * coded.triangles], 1, np.uint32)[:, 0].astype(np.int64)
-    # A code of 0 is a vertex that was not there before: the highest so far is the number of these, less one.
-    new = np.cumsum(codes == 0)
-    indices = np.concatenate(([0], new[:-1])) - codes
-    if len(indices) and (indices.min() < 0 or indices.max() >= n):
+    turned = unfold(join_planes(data[6 * n : 8 * n], 2, np.uint8), np.uint8).view(np.int8)
+    m = 3 * coded.triangles
+    lags = data[8 * n : 8 * n + m]
+    folded = join_planes(data[8 * n + m : 8 * n + 5 * m], 1, np.uint32)[:, 0].astype(np.int64)
+    indices = join_corners(lags, (folded >> 1) ^ -(folded & 1))
+    if m and (indices.min() < 0 or indices.max() >= n):
         raise ValueError("the surface has indices without a vertex")
     vertices = np.array(coded.low_mm) + positions.astype(np.float64) * np.array(coded.step_mm)
-    normals = (turned / np.float32(NORMAL_SCALE)).astype(np.float32)
-    return vertices, normals, indices.reshape(-1, 3).astype(np.uint32)
+    return vertices, fold_octahedron(turned / NORMAL_SCALE), indices.reshape(-1, 3).astype(np.uint32)
+
+
+def join_corners(lags: NDArray[np.uint8], changes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return indices of which each is so far from the one that lies so many back, with 0 from the next new vertex."""
+    indices: list[int] = []
+    new = 0
+    for lag, change in zip(lags.tolist(), changes.tolist(), strict=True):
+        if lag > len(indices):
+            raise ValueError("the surface has indices without a vertex")
+        indices.append((indices[-lag] if lag else new) + change)
+        new = max(new, indices[-1] + 1)
+    return np.array(indices, dtype=np.int64)
+
+
+def fold_octahedron(places: Float64Array) -> NDArray[np.float32]:
+    """Return the unit vectors (n, 3) of places (n, 2) of a square from -1 to 1."""
+    height = 1.0 - np.abs(places).sum(axis=1, keepdims=True)
+    normals = np.hstack([places - np.sign(places) * np.maximum(-height, 0.0), height])
+    return (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
 
 
 def decode_values(facts: dict[str, Any], coded: CodedSurface) -> dict[str, NDArray[np.float64]]:
     """Return the numbers in mm at the vertices of a page by name, NaN where none is known."""
-    planes = unpack_planes(coded)[9 * coded.vertices + 12 * coded.triangles :]
+    planes = unpack_planes(coded)[8 * coded.vertices + 15 * coded.triangles :]
     codes = unfold(join_planes(planes, coded.columns, np.uint16), np.uint16).T
     return {
         column["name"]: np.where(own == STEPS, np.nan, column["low"] + column["step"] * own)
