@@ -11,7 +11,8 @@
       view.box.clientHeight / 2 - dot(away, camera.up) / mm];
   }
 
-  const WIDE = 240, FAIR = 190;  // pixels of a slice that has room for all of its words, for most of them
+  // Pixels of a slice that has room for its number beside the letter of the upper side, for all words, most, its name.
+  const ROOMY = 300, WIDE = 240, FAIR = 190, SLIM = 120;
   const HANDLE = 0.75;  // share of the height at which the line of a comparison has its handle
   const MOST_LETTERS = 24;  // of a name beside a picture; the list has all of it
 
@@ -34,7 +35,7 @@
     const segments = (drawn, name) => {
       for (const [from, to] of drawn) line([from, to], name);
     };
-    if (view.name === "curve") write("along the curve", 10, 14, "name curve", "start");
+    if (view.name === "curve") write(width < FAIR ? "curve" : "along the curve", width < FAIR ? 5 : 10, 14, "name curve", "start");
     if (SLICES.includes(view.name)) annotateSlice(view, write, width, height);
     if (!camera) { view.over.replaceChildren(...drawn); return; }  // a curve is straightened: it has no sides
     const less = (row) => row.map((value) => -value);
@@ -47,7 +48,7 @@
     const end = 14 + length / mm, low = height - 16;
     line([[14, low - 6], [14, low], [end, low], [end, low - 6]], "halo");
     line([[14, low - 6], [14, low], [end, low], [end, low - 6]], "bar");
-    write(sayLength(length) + (camera.parallel ? "" : " in the middle"), 14, low - 17, "side", "start");
+    write(sayLength(length) + (camera.parallel ? "" : " in the middle"), 14, low - 17, width < FAIR ? "side small" : "side", "start");
     if (facts && facts.scale && view.name === "scene") annotateScale(make, write, width, height);
     if (facts && facts.iso) annotateCross(view, make, segments, width, height);
     if (facts) annotateMeasures(view, line, write, width, height);
@@ -61,9 +62,11 @@
     const { number, count, place } = facts ? facts.slices[view.name] : {}, wide = width >= WIDE;
     const [low, high] = facts ? facts.window : [0, 0], level = Math.round((low + high) / 2), span = Math.round(high - low);
     const which = count ? `${number} / ${count}` : "";
-    write(wide ? `${view.name} ${which}` : view.name, wide ? 10 : 5, 14, `name ${wide ? "" : "small "}${view.name}`, "start");
+    const title = width >= ROOMY ? [`${view.name} ${which}`, place]
+      : [width < SLIM ? view.name.slice(0, 3) : view.name, wide ? [which, place].filter(Boolean).join(" · ") : which || place];
+    write(title[0], wide ? 10 : 5, 14, `name ${wide ? "" : "small "}${view.name}`, "start");
     if (!facts) return;
-    write(wide ? place : which || place, wide ? 10 : 5, 32, "words", "start");
+    write(title[1], wide ? 10 : 5, 32, "words", "start");
     view.canvas.role = "img";
     view.canvas.ariaLabel = `${view.name} slice ${count ? `${number} of ${count}` : ""}, ${place}, level ${level}, width ${span} HU`;
     const lines = width >= FAIR ? [`L ${level} W ${span}`] : [];
@@ -151,7 +154,7 @@
 
   // Texts of measures stand in the nearer upper corner, with a thin line to what they belong to: bone stays free.
   function annotateMeasures(view, line, write, width, height) {
-    const placed = SLICES.includes(view.name) ? { start: 2, end: 1 } : { start: 0, end: 1 };  // words, and the button
+    const placed = SLICES.includes(view.name) ? { start: 2, end: width < ROOMY ? 2 : 1 } : { start: 0, end: 1 };  // words, and the button
     const unfinished = facts.points.length ? [{ outline: facts.points.map(({ point }) => point), text: "" }] : [];
     for (const measure of [...facts.measures, ...unfinished]) {
       const points = measure.outline.map((point) => project(view, point)).filter(Boolean), closed = Boolean(measure.voxels);
@@ -160,8 +163,8 @@
         if (points.length > 1) line(points, view.name === "scene" ? `${name} behind` : name);
         for (const [x, y] of closed ? [] : points) { line([[x - 5, y], [x + 5, y]], name); line([[x, y - 5], [x, y + 5]], name); }
       }
-      if (!measure.text) continue;
-      const wide = width >= WIDE, value = measure.kind === "seed" ? "" : measure.text;
+      if (!measure.text || width < FAIR) continue;  // the list has it
+      const wide = width >= WIDE && height >= FAIR, value = measure.kind === "seed" ? "" : measure.text;
       const name = measure.name.length > MOST_LETTERS ? `${measure.name.slice(0, MOST_LETTERS - 1)}…` : measure.name;
       const words = wide ? `${name} ${value}`.trim() : value || name;
       const middle = points.length === 3 && measure.kind === "angle" ? points[1]

@@ -68,9 +68,21 @@ def test_slice_says_its_number_place_and_window(page) -> None:
 
     said = words_on(page, "axial")
 
-    assert f"axial {shown['number']} / {shown['count']}" in said
-    assert shown["place"] in said
+    assert said[:2] == ["axial", f"{shown['number']} / {shown['count']} · {shown['place']}"]
     assert "L 300 W 1500" in said  # the window that a view begins with
+
+
+@pytest.mark.parametrize("stage_width", [330, 700, 1200])
+def test_name_of_a_slice_ends_left_of_the_letter_of_its_upper_side(page, stage_width: int) -> None:
+    page.execute_script("document.getElementById('stage').style.maxWidth = `${arguments[0]}px`", stage_width)
+    wait_for(page, f"return coronal.clientWidth <= {stage_width / 3} && clrecon.facts.settled")
+
+    name, letter = page.execute_script(
+        "const [name, letter] = ['name', 'side'].map((kind) => coronal.querySelector(`text.${kind}`));"
+        "return [name.getBoundingClientRect().right, letter.getBoundingClientRect().left];"
+    )
+
+    assert name < letter
 
 
 def test_slice_says_hu_and_place_of_the_point_under_the_mouse(page) -> None:
