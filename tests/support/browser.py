@@ -17,7 +17,10 @@ import pytest
 FLAGS = (
     "--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--hide-scrollbars", "--force-device-scale-factor=1",
+    "--disable-gpu-rasterization", "--disable-gpu-compositing",
 )  # fmt: skip
+"""Only WebGL is left to the graphics in software: pages that they put together too take more than twice the time."""
+
 SECONDS = 60.0
 """Until a small page is ready; it takes 1 s where nothing else runs."""
 
