@@ -60,7 +60,7 @@ def find_self_intersections(
     corners = np.ascontiguousarray(triangles.T)
     points = [columns.take(corner, axis=1) for corner in corners]
     planes = _Planes.of(vertices, triangles, points)
-    has_area: NDArray[np.bool_] = planes.normal.any(axis=0)
+    has_area = np.asarray(planes.normal.any(axis=0))
     flat = np.flatnonzero(~has_area)
     has_area[flat] = _has_area(vertices[triangles[flat].T].astype(np.float64))
     if not (sound.all() and has_area.all()):  # thousands at one place would all be paired

@@ -18,9 +18,11 @@ from clrecon.mesh import Mesh, split_components
 from clrecon.mesh.compare.distances import SurfaceDistance
 from clrecon.mesh.connectivity import find_edges, label_components
 from clrecon.mesh.intersections import find_self_intersections
+from clrecon.mesh.refine import decimation
 from clrecon.mesh.refine.decimation import check_refinement
 from clrecon.mesh.refine.shifts import enclosed_mm3
 from clrecon.mesh.refine.smoothing import smooth_mesh
+from clrecon.operators.surface.collapse import DeviceCollapser
 from clrecon.operators.surface.decimation import decimate_mesh
 from clrecon.proof.surface.extract import extract_isosurface
 
@@ -229,3 +231,42 @@ def test_a_decimated_surface_has_the_bits_of_the_default_device_each_time(device
     for other in (again, default):
         np.testing.assert_array_equal(small.vertices, other.vertices)
         np.testing.assert_array_equal(small.triangles, other.triangles)
+
+
+class CountingCollapser(DeviceCollapser):
+    """Counts the edges that are tried, and the triangles whose distance from the other surface is measured."""
+
+    tried = measured = 0
+
+    def run_round(self, number, octave, most):
+        selected, done = super().run_round(number, octave, most)
+        self.tried += selected
+        return selected, done
+
+    def find_near_faces(self, corners, hints, present, limit):
+        self.measured += len(corners)
+        return super().find_near_faces(corners, hints, present, limit)
+
+
+def test_of_four_surfaces_four_times_as_many_edges_are_tried_and_triangles_measured_as_of_one(device):
+    """Growth is linear: more of the same takes as many rounds, and what stays is not measured again in each turn."""
+    noise = noise_surface(seed=0)
+    counts = []
+    for copies in (1, 4):
+        surfaces = [(noise.vertices + (20.0 * number, 0, 0), noise.triangles) for number in range(copies)]
+        collapsers = []
+
+        def make_collapser(surface, limit, into=collapsers):
+            into.append(CountingCollapser(device, surface, limit))
+            return into[0]
+
+        mesh = Mesh(*samples.join(*surfaces))
+        small = decimation.decimate_mesh(mesh, 0.9, DEFAULT_BOUND_MM, make_collapser=make_collapser)
+        facts = small.report["refinement"]["decimate"]
+        assert facts["vertices_taken_back"] > 20 * copies  # else the turns after the first have nothing to measure
+        assert collapsers[0].measured < 2 * mesh.triangle_count  # measured 1.54 and 1.55: once, and once what is left
+        counts.append((facts["rounds"], collapsers[0].tried, collapsers[0].measured))
+    (rounds, tried, measured), (rounds_of_4, tried_of_4, measured_of_4) = counts
+    assert rounds_of_4 < 1.5 * rounds  # measured 44 and 40
+    assert tried_of_4 < 4.4 * tried  # measured 4.00
+    assert measured_of_4 < 4.4 * measured  # measured 4.01
