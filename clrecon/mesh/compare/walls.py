@@ -20,7 +20,6 @@ from clrecon.geometry.iso_rule import IsoRule
 from clrecon.mesh.compare.iso_distance import trilinear_values
 from clrecon.mesh.mesh import Mesh
 from clrecon.system.light_dataclass import dataclass
-from clrecon.system.pieces import list_distinct
 from clrecon.system.records import Record
 
 COMPACT_HU = 600.0
@@ -31,6 +30,8 @@ _FLAT_MM, _FLAT_HU = (1.5, 2.0, 2.5, 3.0, 3.5, 4.0), 120.0
 """A wall is flat where values at these depths below it, in voxels of above 1 mm, differ by at most `_FLAT_HU`."""
 NEAR_MM, _NEAR_STEPS = 15.0, 5.0
 """Bone has a compact wall within this distance, or this number of voxels, of every place; coarse voxels blur most."""
+_CELLS_AROUND = 3**0.5
+"""It is looked for in the cell of this size and in the 26 around it."""
 _LEAST_COMPACT = 0.05
 FAINT_HU, _FAINT_SPREAD_HU = 500.0, 200.0
 """Thin bone without walls reaches the first value, and exceeds the median by the second; vessels have one value."""
@@ -79,7 +80,12 @@ def sample_walls(vertices: NDArray[np.floating], normals: NDArray[np.floating], 
     deep = look_beneath(_FLAT_MM, longer)
     low, high = deep.min(axis=0), deep.max(axis=0)
     flat = (wall < COMPACT_HU) & (low > rule.iso_level) & (high - low < _FLAT_HU)
-    return Walls(points, wall, flat, max(NEAR_MM, _NEAR_STEPS * max(volume.spacing)))
+    return Walls(points, wall, flat, near_mm(volume))
+
+
+def near_mm(volume: Volume) -> float:
+    """Return within which distance of every place bone has a compact wall."""
+    return max(NEAR_MM, _NEAR_STEPS * max(volume.spacing))
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +111,7 @@ def judge_walls(walls: Walls) -> WallLook:
     median, p90, p99 = (float(value) for value in np.percentile(walls.wall, (50, 90, 99)))
     compact = walls.wall >= COMPACT_HU
     compact_share = float(compact.mean())
-    contrast_share = float((walls.flat & ~_is_near(walls.points, compact, walls.near_mm)).mean())
+    contrast_share = float((walls.flat & ~lie_near(walls.points, compact, walls.near_mm, _CELLS_AROUND)).mean())
     metal_share = float((walls.wall > METAL_HU).mean())
     if metal_share > 0.5:
         looks_like = "metal"
@@ -214,15 +220,18 @@ def normals_of(mesh: Mesh) -> NDArray[np.float32]:
     return mesh.normals
 
 
-def _is_near(points: NDArray[np.float64], marked: NDArray[np.bool_], size_mm: float) -> NDArray[np.bool_]:
-    """Mark points that have a marked one in their own cell of `size_mm` or in one of the 26 neighbours."""
-    cells = np.floor((points - points.min(axis=0)) / size_mm).astype(np.int64) + 1
-    sizes = cells.max(axis=0) + 2
-    strides = np.array([sizes[1] * sizes[2], sizes[2], 1])
-    near = list_distinct(cells[marked] @ strides)
-    for stride in strides:
-        near = list_distinct(np.concatenate([near - stride, near, near + stride]))
-    return np.isin(cells @ strides, near)
+def lie_near(
+    points: NDArray[np.floating], marked: NDArray[np.bool_], size_mm: float, cells: float
+) -> NDArray[np.bool_]:
+    """Mark points, mm, whose cell of `size_mm` is at most so many cells from the nearest one with a marked point."""
+    from scipy.ndimage import distance_transform_edt
+
+    if not marked.any():
+        return np.zeros(len(points), dtype=bool)
+    places = np.floor((points - points.min(axis=0)) / size_mm).astype(np.int64)
+    is_empty = np.ones(places.max(axis=0) + 1, dtype=bool)
+    is_empty[tuple(places[marked].T)] = False
+    return np.asarray(distance_transform_edt(is_empty)[tuple(places.T)] <= cells)
 
 
 def lie_near_line(points: NDArray[np.floating], line: NDArray[np.float64], distance: float) -> NDArray[np.bool_]:

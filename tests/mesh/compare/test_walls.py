@@ -13,9 +13,9 @@ from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.mesh import Mesh
 from clrecon.mesh.compare.walls import (
     Walls,
-    _is_near,
     judge_components,
     judge_walls,
+    lie_near,
     lie_near_line,
     looks_like_bone,
     normals_of,
@@ -271,7 +271,7 @@ def test_points_in_a_cell_and_its_26_neighbours_are_near(spacing):
     marked = np.multiply([1, 0, 2], spacing)
     is_marked = (places == marked).all(axis=1)
     is_neighbour = (np.abs(places - marked) <= 7.0).all(axis=1)
-    np.testing.assert_array_equal(_is_near(places + 0.5, is_marked, size_mm=7.0), is_neighbour)
+    np.testing.assert_array_equal(lie_near(places + 0.5, is_marked, size_mm=7.0, cells=3**0.5), is_neighbour)
 
 
 POINTS_BESIDE_AN_L = {

@@ -17,6 +17,7 @@ from clrecon.operators.surface.cortex import CortexConstants, ProfileSampler, Pr
 from clrecon.operators.surface.cortex_constants import MOST_WALLS
 from clrecon.operators.surface.cortex_fit import (
     _STATES,
+    BADLY_FITTED,
     FITTED,
     METAL,
     NO_ROOM,
@@ -364,6 +365,42 @@ def test_sheets_of_a_couch_around_a_shell_leave_the_constants_of_its_bone(device
     assert fit.constants.cortex_hu == pytest.approx(1000.0, rel=0.05)  # measured 985
     assert fit.constants.blur_mm == pytest.approx(np.hypot(0.7, 0.4), abs=0.1)  # with that of the interpolation
     assert fit.constants.thick > 300  # measured 494
+
+
+def test_vessel_farther_than_15_mm_from_bone_is_not_fitted(device):
+    """A vessel of 350 HU and 6 mm in a lung, from 9 mm above a shell of bone on: its edges look like thin walls."""
+    shell = hollow_ball(thickness=3.0).voxels
+    j, i = np.ogrid[: shell.shape[1], : shell.shape[2]]
+    vessel = np.rint(-800.0 + 1150.0 * ndtr((3.0 - np.hypot(j - MIDDLE[1], i - MIDDLE[0])) / 0.7)).astype(np.int16)
+    volume = Volume(np.concatenate([shell, np.broadcast_to(vessel, (60, *vessel.shape))]), np.eye(4))
+
+    mesh, fit = fit_surface(volume, device)
+
+    beyond_mm = mesh.vertices[:, 2] - (MIDDLE[2] + OUTER_RADIUS)
+    is_wall = np.isin(fit.states, (FITTED, BADLY_FITTED))
+    cell_mm = 5.0 * np.sqrt(3.0)  # the diagonal of the cells of 15 / 3 mm that near ones are looked for in
+    assert not is_wall[beyond_mm > 15.0 + cell_mm].any()
+    assert is_wall[(beyond_mm > 10.0) & (beyond_mm < 12.0)].mean() > 0.5
+
+
+def in_air(volume: Volume) -> Volume:
+    """The same with the tissue of 50 HU, and all else, lower by 1050 HU."""
+    return Volume(volume.voxels - np.int16(1050), volume.affine)
+
+
+FAINT_WALLS = {
+    "thin and blurred": (hollow_ball(thickness=1.0, blur=1.5), 200.0, {"blur_mm": 1.55, "blur_across_mm": 1.55}),
+    "of 400 HU": (hollow_ball(thickness=3.0, cortex=400.0, inner=100.0), 200.0, {"cortex_hu": 400.0}),
+    "thin, in air": (in_air(hollow_ball(thickness=0.8, cortex=2050.0, inner=50.0)), -300.0, {"noise_hu": None}),
+}
+
+
+@pytest.mark.parametrize(("volume", "level", "known"), FAINT_WALLS.values(), ids=FAINT_WALLS)
+def test_bone_without_compact_walls_is_fitted(device, volume, level, known):
+    assert volume.voxels.max() < 0.45 * 1000.0  # HU; the cortex of the scan has 1000
+    constants = constants_with_blurs(within_mm=0.8, across_mm=0.8).changed(**known)
+    _, fit = fit_surface(volume, device, level=level, constants=constants)
+    assert np.count_nonzero(fit.states == NOT_BONE) < 0.05 * len(fit.states)
 
 
 @pytest.fixture(scope="module")
