@@ -197,14 +197,14 @@ PETABYTE = 10**15
 
 def test_file_larger_than_the_free_space_is_refused_before_it_is_written(older):
     calls: list = []
-    with refused(OutputError, "MB", "free", PETABYTE / 10**6):
+    with refused(OutputError, "GB", "free", PETABYTE / 10**9):
         replace_file(older, calls.append, expected_bytes=PETABYTE)
     assert calls == []
     check_untouched(older)
 
 
 def test_target_without_enough_free_space_is_refused_as_a_full_disk_is(older):
-    with refused(OutputError, "MB", "free", PETABYTE / 10**6) as caught:
+    with refused(OutputError, "GB", "free", PETABYTE / 10**9) as caught:
         check_writable(older, expected_bytes=PETABYTE)
     assert caught.value.__cause__.errno == errno.ENOSPC
     check_untouched(older)

@@ -223,7 +223,7 @@ def test_nothing_is_removed_where_the_bound_allows_nothing():
 
 
 @pytest.mark.every_device
-@pytest.mark.parametrize(("share", "bound"), [(0.5, 0.5), (0.9, 0.1)])
+@pytest.mark.parametrize(("share", "bound"), [pytest.param(0.5, 0.5, marks=pytest.mark.first_device), (0.9, 0.1)])
 def test_a_decimated_surface_has_the_bits_of_the_default_device_each_time(device, share, bound):
     vertices, triangles = samples.sphere(FAR, radius=20.0, rounds=4)
     rough = Mesh(vertices + np.random.default_rng(1).normal(0.0, 0.05, vertices.shape), triangles)
