@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import gzip
 import hashlib
 import logging
 import re
+import urllib.request
 
 import pytest
 from refusals import refused
@@ -173,3 +175,11 @@ def test_secret_is_not_logged(views: Views, caplog: pytest.LogCaptureFixture) ->
 async def leave_at_once(running: WebServer) -> None:
     async with browsing(running) as client:
         await client.until(lambda: client.facts)
+
+
+def test_page_is_sent_in_a_third_of_its_bytes_to_a_browser_that_takes_gzip(served: WebServer) -> None:
+    address = f"http://127.0.0.1:{served.port}/?secret={secret_of(served)}"
+    with urllib.request.urlopen(urllib.request.Request(address, headers={"Accept-Encoding": "gzip"})) as answer:
+        packed = answer.read()
+
+    assert len(packed) < len(gzip.decompress(packed)) / 3  # measured 0.29
