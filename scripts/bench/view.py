@@ -101,6 +101,33 @@ def _steps(view: Any, hu: float) -> Iterator[tuple[str, Callable[[], Any]]]:
     yield "moving with a part hidden", hidden
 
 
+SHARP_SIZE = (754, 822)
+SHARP_BARS_MS = {"drr": 1000.0, "mip": 600.0, "muscle": 600.0, "lung": 600.0}
+
+
+@case("view-sharp", "sharp pictures of 754 x 822 in the modes that take longest, another side each; it has no peer")
+def measure_sharp(job: Job) -> dict[str, Any]:
+    from clrecon.viewer.drawing.painter import Painter
+    from clrecon.viewer.model.model import ViewModel
+    from clrecon.viewer.model.objects import show_objects
+
+    objects = show_objects([job.input.volume()])
+    model = ViewModel(objects, iso_value=job.hu)
+    model.set_aspect(SHARP_SIZE[0] / SHARP_SIZE[1])
+    turns = cycle((0.01, -0.01))
+    found: dict[str, Any] = {}
+    with Painter(objects, device=job.device) as painter:
+
+        def take() -> None:
+            model.turn(next(turns), 0.0)
+            painter.picture(model.state, SHARP_SIZE)
+
+        for mode in SHARP_BARS_MS:
+            model.set_mode(mode)
+            found[mode] = _alone(take, job, None)
+    return {"ratios": {}, "size": SHARP_SIZE, "modes": found, "bars_wall_ms": SHARP_BARS_MS}
+
+
 @case("view-picks", "distance of 2,000 picks in a picture to the mesh of the same iso value, mm; it has no peer")
 def measure_picks(job: Job) -> dict[str, Any]:
     """Pick pixels that show bone, evenly over them, from three sides."""

@@ -1,20 +1,24 @@
-"""The view in a browser: pictures a second in Chromium on the same machine, and bytes of a visit."""
+"""The view in a browser: its start, pictures a second in Chromium on the same machine, bytes, memory, and its page."""
 
 from __future__ import annotations
 
 import json
+import os
+import pty
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from measure import spread
+from measure import busy_seconds, spread
 from registry import Job, case
 
 WINDOW = (1100, 800)
@@ -75,9 +79,9 @@ def measure_view_web(job: Job) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scan.nii"
         write_volume(job.input.volume(), path)
-        with _server(path, job) as address, _browser() as page:
+        with _served(path, job, "--hu", f"{job.hu:g}") as served, _browser() as page:
             start = time.perf_counter()
-            page.get(address)
+            page.get(served.address)
             _wait(page, "return clrecon.pictures > 0")
             first = time.perf_counter() - start
             _settle(page)
@@ -104,24 +108,147 @@ def measure_view_web(job: Job) -> dict[str, Any]:
     }
 
 
-@contextmanager
-def _server(path: Path, job: Job) -> Iterator[str]:
-    command = [sys.executable, "-m", "clrecon", "view", str(path), "--no-open", "--json"]
-    process = subprocess.Popen(
-        [*command, "--device", str(job.device.index), "--hu", f"{job.hu:g}"], stdout=subprocess.PIPE, text=True
+@case(
+    "view-web-start",
+    "seconds from the start of a process, kernels in the cache, to its first words in the terminal, to its address and"
+    " to the picture in a Chromium that is open; no peer",
+)
+def measure_start(job: Job) -> dict[str, Any]:
+    """Start processes that show a folder of DICOM as bone without its table; the first is not counted."""
+    folder = job.input.ct_folder()
+    runs: list[dict[str, float]] = []
+    with _browser() as page:
+        for _ in range(max(2, min(job.pairs, 5)) + 1):
+            page.get("about:blank")
+            begin = time.perf_counter()
+            with _served(folder, job) as served:
+                address = time.perf_counter()
+                page.get(served.address)
+                _wait(page, "return clrecon.pictures > 0")
+                picture = time.perf_counter()
+                used = cpu_seconds(served.process.pid)
+            assert served.spoke is not None
+            ends = {"words_s": served.spoke, "address_s": address, "picture_s": picture}
+            runs.append({name: end - begin for name, end in ends.items()} | {"server_cpu_s": used})
+    figures = {name: spread([run[name] for run in runs[1:]]) for name in runs[0]}
+    return {"ratios": {}, **figures, "bars_s": {"words": 0.5, "picture": 1.5}}
+
+
+SESSIONS = (10, 110)
+MOST_GROWTH_MB = 20.0
+
+
+@case("view-web-sessions", "memory of the server after 10 browsers that looked and left, and after 110; no peer")
+def measure_sessions(job: Job) -> dict[str, Any]:
+    """Connect, wait for a sharp picture and leave, one browser after another, each in a tab of its own."""
+    with _served(job.input.ct_folder(), job) as served:
+        resident: dict[int, float] = {}
+        for number in range(1, SESSIONS[-1] + 1):
+            look_and_leave(served.address, f"bench{number:04d}")
+            if number in SESSIONS:
+                time.sleep(2.0)
+                resident[number] = resident_mb(served.process.pid)
+    grown = resident[SESSIONS[1]] - resident[SESSIONS[0]]
+    return {"ratios": {}, "resident_mb": resident, "grown_mb": grown, "bar_grown_mb": MOST_GROWTH_MB}
+
+
+def look_and_leave(address: str, tab: str) -> None:
+    """Connect as the page does, and leave once a sharp picture has come."""
+    import websocket
+
+    base, _, secret = address.partition("/?")
+    socket = websocket.create_connection(
+        f"{base.replace('http', 'ws')}/socket?{secret}&tab={tab}", origin=base, timeout=PATIENCE_S
     )
+    layout = {"type": "layout", "sizes": {"scene": [544, 579]}, "ground": [0, 0, 0]}
+    socket.send(json.dumps(layout))
+    is_sharp = False
+    while not is_sharp:
+        data = socket.recv()
+        if isinstance(data, bytes):
+            head = json.loads(data[4 : 4 + int.from_bytes(data[:4], "little")])
+            socket.send(json.dumps({"type": "shown", "number": head["number"]}))
+            is_sharp = head["sharp"]
+    socket.close()
+
+
+@case("view-page", "bytes a triangle of the page that view --html writes, and milliseconds until it is ready; no peer")
+def measure_page(job: Job) -> dict[str, Any]:
+    import clrecon
+
+    mesh = clrecon.extract_isosurface(job.input.volume(), job.hu, device=job.device)
+    with tempfile.TemporaryDirectory() as folder, _browser() as page:
+        path = Path(folder) / "page.html"
+        begin = busy_seconds()
+        mesh.save(path)
+        written = busy_seconds() - begin
+        ready = []
+        for _ in range(max(3, min(job.pairs, 7))):
+            page.get(path.as_uri())
+            _wait(page, "return document.documentElement.dataset.ready")
+            ready.append(float(page.execute_script("return document.documentElement.dataset.ready")))
+        size = path.stat().st_size
+    return {
+        "ratios": {},
+        "triangles": mesh.triangle_count,
+        "bytes": size,
+        "bytes_a_triangle": round(size / mesh.triangle_count, 3),
+        "written_cpu_s": round(written, 3),
+        "ready_ms": spread(ready),
+        "bars": {"bytes_a_triangle": 5.0, "ready_ms": 2000.0},
+    }
+
+
+def cpu_seconds(pid: int) -> float:
+    """Processor seconds of a process so far."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def resident_mb(pid: int) -> float:
+    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    return round(pages * os.sysconf("SC_PAGE_SIZE") / 1e6, 1)
+
+
+@dataclass
+class _Served:
+    """A server: its address, and when it wrote its first words to its terminal."""
+
+    process: subprocess.Popen[str]
+    address: str = ""
+    spoke: float | None = None
+
+
+@contextmanager
+def _served(path: Path, job: Job, *options: str) -> Iterator[_Served]:
+    """Start a server as in a terminal, which is given back once its address is known."""
+    own, terminal = pty.openpty()
+    command = [sys.executable, "-m", "clrecon", "view", str(path), "--no-open", "--device", str(job.device.index)]
+    process = subprocess.Popen([*command, *options], stdout=subprocess.PIPE, stderr=terminal, text=True)
+    os.close(terminal)
+    served = _Served(process)
+
+    def listen() -> None:
+        with suppress(OSError):  # as a terminal says that its other side is closed
+            while os.read(own, 4096):
+                served.spoke = served.spoke or time.perf_counter()
+
+    listener = threading.Thread(target=listen)
+    listener.start()
     try:
         assert process.stdout is not None
-        text = ""
-        while not text.endswith("}\n"):
+        while not served.address:
             line = process.stdout.readline()
             if not line:
                 raise RuntimeError("the server ended before it was ready")
-            text += line
-        yield str(json.loads(text)["address"])
+            if line.startswith("view "):
+                served.address = line.split()[1]
+        yield served
     finally:
         process.send_signal(signal.SIGINT)
         process.wait(PATIENCE_S)
+        listener.join(PATIENCE_S)
+        os.close(own)
 
 
 @contextmanager
