@@ -6,27 +6,27 @@ import argparse
 import json
 import os
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from clrecon.cli import common
 from clrecon.cli.console import Console, printable
-from clrecon.cli.mesh import add_mesh_options, mesh_fields
+from clrecon.cli.mesh import add_mesh_options
 from clrecon.errors import UsageError
 from clrecon.jobs.batch.plan import COLUMNS, PAGE, TABLE, BatchSettings, Plan, read_cases
-from clrecon.jobs.mesh.purposes import settings_for
-from clrecon.jobs.mesh.settings import MeshSettings
-from clrecon.jobs.options import ALL_DEVICES, ScanSettings
+from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
+from clrecon.jobs.options import ALL_DEVICES, locate_region_rule
 from clrecon.system.arguments import current_speaker
+from clrecon.system.light_dataclass import replace
 from clrecon.system.progress import DEFAULT_SECONDS
 
 if TYPE_CHECKING:
     from clrecon.jobs.batch.job import BatchReport
     from clrecon.jobs.batch.scheduler import Outcome
 
-_EPILOG = f"""\
-A manifest is a table in UTF-8 with commas or semicolons. Its first line names the columns {", ".join(COLUMNS)};
-series and labels may be left out. Paths start at its folder. Of a folder each series of CT slices is a case, named by
-its number.
+_EPILOG = """\
+A manifest is a table in UTF-8 with commas or semicolons. Its first line names the columns: case, input, and if needed
+labels and options of the meshes and pictures, such as hu. Paths start at its folder. Of a folder each series of CT
+slices is a case, named by its number.
 
 OUT/CASE holds the mesh, a picture, with labels a table of them, and case.json, all or nothing. OUT/cohort.csv and
 OUT/cohort.html show all cases, and name no file and no patient. See docs/batch.md.
@@ -56,19 +56,17 @@ def run(options: argparse.Namespace, console: Console) -> int:
     if options.device == ALL_DEVICES and options.devices is None:
         options.device, options.devices = None, ALL_DEVICES
     batch = common.make_settings(BatchSettings, options)
-    cases = read_cases(options.input, common.make_settings(ScanSettings, options))
-    is_labelled = {case.labels is not None for case in cases}
-    view = {} if batch.state is None else _carry_view(batch.state, is_labelled)
     plan = Plan(
         output=options.output,
         batch=batch,
-        plain=_make_settings(options, None) if False in is_labelled else None,
-        labelled=_make_settings(options, "") if True in is_labelled else None,
+        given=_pick_options(options),
         options=getattr(current_speaker(), "options", None),
         timeout=DEFAULT_SECONDS if options.timeout is None else options.timeout,
         no_clobber=options.no_clobber,
-        **view,
     )
+    cases = read_cases(options.input, plan)
+    if batch.state is not None:
+        plan = replace(plan, **_carry_view(batch.state, {case.labels is not None for case in cases}))
 
     def tell_outcome(outcome: Outcome) -> None:
         answer = outcome.answer
@@ -89,23 +87,23 @@ def run(options: argparse.Namespace, console: Console) -> int:
     return report.exit_code
 
 
-def _carry_view(path: str, is_labelled: set[bool]) -> dict[str, str]:
+def _carry_view(path: str, is_labelled: set[bool]) -> dict[str, Any]:
     """Return the entries of a plan of what a saved view shows of the cases, and by what it is drawn."""
     from clrecon.viewer.model.saved_view import carry_view, read_view
     from clrecon.viewer.session.opening import draw_carried
 
     view = carry_view(read_view(path))
     if False in is_labelled and "labels" in view["objects"]:
-        raise UsageError(f"the saved view shows a label map: name one in the column {COLUMNS[3]} of each row")
+        raise UsageError(f"the saved view shows a label map: name one in the column {COLUMNS[2]} of each row")
     return {"carried": json.dumps(view, sort_keys=True), "drawer": f"{draw_carried.__module__}:{draw_carried.__name__}"}
 
 
-def _make_settings(options: argparse.Namespace, labels: str | None) -> MeshSettings:
-    """Make the settings of meshes without labels, or with a label map that each case names."""
-    options.path = labels
-    given = mesh_fields(options, f"in the column {COLUMNS[3]} of each row")
+def _pick_options(options: argparse.Namespace) -> dict[str, Any]:
+    """Return the options of the meshes by their names; the files of regions by full paths, for workers elsewhere."""
+    given = common.pick(options, LabelChoice) | common.pick(options, MeshSettings)
     given.pop("scheduler", None)  # deals out cases here
-    return MeshSettings(**settings_for(given.pop("purpose", None), given))
+    rules = [locate_region_rule(rule, os.getcwd()) for rule in given.get("region", ())]
+    return given | ({"region": tuple(rules)} if rules else {})
 
 
 def _describe_batch(report: BatchReport, output: str, *, is_part: bool) -> list[str]:

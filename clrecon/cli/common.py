@@ -9,22 +9,19 @@ import sys
 import textwrap
 import traceback
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
-from dataclasses import fields
-from typing import Any, NoReturn, TypeVar, cast
+from typing import Any, NoReturn, cast
 
 from clrecon.cli.console import STREAMED, Console, fit_help, printable
 from clrecon.errors import ClreconError, OutputError, UsageError
 from clrecon.jobs.options import DeviceSettings, InputSettings, ScanSettings
 from clrecon.system.arguments import OptionSpeaker
-from clrecon.system.options import option_beside, options_of
+from clrecon.system.options import Settings, option_beside, options_of, pick_fields, read_value
 from clrecon.system.packages import missing_package
 from clrecon.system.processes import has_hung_device
 from clrecon.system.progress import DEFAULT_SECONDS, check_time_limit
 from clrecon.system.text import format_bytes, guess_word
 
 _INTERRUPTED = 130
-
-Settings = TypeVar("Settings")
 
 _LONG_WORD = re.compile(r"[^\s/\\]{300,}")
 
@@ -107,19 +104,12 @@ class Parser(argparse.ArgumentParser):
         return super()._get_values(action, arg_strings)
 
     def _get_value(self, action: argparse.Action, arg_string: str) -> Any:  # type: ignore[override]
-        """Read a value; a ValueError is the refusal.  What is no number is said with the unit that must not follow."""
-        read: Any = action.type or str
         try:
-            return read(arg_string)
-        except UsageError:  # it says all by itself
+            return read_value(cast("Callable[[str], Any] | None", action.type), arg_string, action.metavar)
+        except UsageError:
             raise
         except ValueError as error:
-            text = str(error)
-            if read in (int, float):
-                number = "whole number" if read is int else "number"
-                unit = ": write the length in mm, without a unit" if action.metavar == "MM" else ""
-                text = f"{arg_string!r:.80} is no {number}{unit}"
-            raise argparse.ArgumentError(action, text) from None
+            raise argparse.ArgumentError(action, str(error)) from None
 
     def format_help(self) -> str:
         """Return the help text; where all options do not fit one screen, those that most people need."""
@@ -231,25 +221,12 @@ def add_common(parser: argparse.ArgumentParser) -> None:
 
 def pick(options: argparse.Namespace, settings: type) -> dict[str, Any]:
     """Pick the options that are fields of settings and that are given; those that may be given again make a tuple."""
-    given = {own.name: getattr(options, own.name, None) for own in fields(settings)}
-    return {
-        name: tuple(value) if isinstance(value, list) else value for name, value in given.items() if value is not None
-    }
+    return pick_fields(settings, vars(options))
 
 
 def make_settings(settings: type[Settings], options: argparse.Namespace, **more: Any) -> Settings:
     """Make settings from the options that are their fields, and more fields, which win."""
     return settings(**pick(options, settings) | more)
-
-
-def make_part(part: type[Settings], options: argparse.Namespace, owner: str | None, needs: str) -> Settings | None:
-    """Make settings that mean nothing without the option of `owner`, None where it has no value; `needs` says which."""
-    if owner is not None:
-        return make_settings(part, options)
-    for option in options_of(part):
-        if getattr(options, option.name) is not None:
-            raise UsageError(f"{option.flags[0]} {needs}")
-    return None
 
 
 def add_fields(

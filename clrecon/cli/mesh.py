@@ -8,8 +8,7 @@ from typing import Any
 
 from clrecon.cli import common
 from clrecon.cli.console import Console, printable
-from clrecon.jobs.mesh.purposes import settings_for
-from clrecon.jobs.mesh.seeds import is_label_seed
+from clrecon.jobs.mesh.purposes import settings_from
 from clrecon.jobs.mesh.settings import GATE_FAILED, SCAN_GATE_FAILED, LabelChoice, MeshSettings
 from clrecon.jobs.mesh.surfaces import VALUE_GATES, names_level
 from clrecon.jobs.outputs import MESH_FILES, name_outputs
@@ -99,26 +98,10 @@ def add_labels(parser: argparse.ArgumentParser, without: Container[str] = ()) ->
     common.add_fields(parser.add_argument_group("labels", about), LabelChoice, without=without)
 
 
-def mesh_fields(options: argparse.Namespace, labels_by: str = "with --labels FILE") -> dict[str, Any]:
-    """Return the fields of `MeshSettings` that the options give; a message says `labels_by` what a label map comes."""
-    given = common.pick(options, MeshSettings)
-    given |= given.pop("iso_value", {})  # one of two fields
-    needs = f"says how labels become meshes: give their file {labels_by}"
-    if given.get("surface") == "cortex":  # labels pick the cells, as with hu
-        options = argparse.Namespace(**{**vars(options), "surface": "hu"})
-    labels = common.make_part(LabelChoice, options, options.path, needs)
-    if labels is not None:
-        given["labels"] = labels
-        if given.get("solid") and not any(map(is_label_seed, given.get("grow_from", ()))):
-            del given["solid"]  # it says how each label becomes a mesh
-    return given
-
-
 def run(options: argparse.Namespace, console: Console) -> int:
     from clrecon.jobs.mesh.job import make_mesh, makes_objects
 
-    given = mesh_fields(options)
-    settings = MeshSettings(**settings_for(given.pop("purpose", None), given))
+    settings = settings_from(vars(options))
     report = make_mesh(
         options.input,
         options.output,

@@ -36,7 +36,7 @@ from clrecon.jobs.render.settings import (
 )
 from clrecon.jobs.view import ViewSettings
 from clrecon.system.light_dataclass import dataclass
-from clrecon.system.options import numbers_reader, option, options_of
+from clrecon.system.options import make_part, numbers_reader, option, options_of
 from clrecon.system.records import describe_volume
 from clrecon.system.text import count_of, format_bytes, to_hexadecimal, unknown_name
 
@@ -282,9 +282,9 @@ def render_settings(options: argparse.Namespace) -> RenderSettings:
         "views": tuple(chain(*options.views or ())),
         "thickness": options.thickness or None,  # 0 is the same as no thickness
         "offset_mm": options.offset_mm or None,
-        "labels": common.make_part(LabelLook, options, options.path, look),
+        "labels": make_part(LabelLook, vars(options), options.path, look),
         "meshes": tuple(MeshFile(*given) for given in options.meshes),
-        "turntable": common.make_part(Turntable, options, options.turntable, turn),
+        "turntable": make_part(Turntable, vars(options), options.turntable, turn),
     }
     return RenderSettings.of(**{name: value for name, value in given.items() if value is not None})
 

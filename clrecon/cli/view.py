@@ -8,8 +8,9 @@ from typing import Any
 
 from clrecon.cli import common
 from clrecon.cli.console import Console, printable
-from clrecon.cli.mesh import add_labels, add_levels, mesh_fields
+from clrecon.cli.mesh import add_labels, add_levels
 from clrecon.errors import UsageError
+from clrecon.jobs.mesh.purposes import mesh_fields
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.options import size_option, space_option
 from clrecon.jobs.view import ViewSettings
@@ -99,7 +100,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
 
 def _settings(options: argparse.Namespace) -> ViewSettings:
-    return common.make_settings(ViewSettings, options, scan=MeshSettings(**mesh_fields(options)))
+    return common.make_settings(ViewSettings, options, scan=MeshSettings(**mesh_fields(vars(options))))
 
 
 def _check_faces(options: argparse.Namespace) -> None:

@@ -40,6 +40,8 @@ _SETTINGS: Mapping[str, Any] = {
     # Looks of the processes at themselves: by default 3 % of a core beside a cluster of one worker, so 1 %.
     "distributed.admin.tick.interval": "2s",
     "distributed.admin.system-monitor.interval": "10s",
+    # Dask gives up a worker that needs longer to start again; `Cluster` replaces those that have ended.
+    "distributed.deploy.lost-worker-timeout": "24h",
     # All memory of a case is "unmanaged", for which Dask would pause its workers.
     "distributed.worker.memory.target": False,
     "distributed.worker.memory.spill": False,
@@ -70,12 +72,15 @@ def check_address(address: str) -> str:
 class Cluster:
     """The workers of a scheduler; `open_cluster` makes one."""
 
-    def __init__(self, client: Any, address: str, warn: Callable[[str], None]):
-        self._client = client
+    def __init__(self, client: Any, address: str, warn: Callable[[str], None], local: Any = None):
+        self._client, self._local = client, local
         self._address, self._warn = address, warn
 
     def count_workers(self) -> int:
+        """Return the number of workers that are there; of this command's own, those that have ended are replaced."""
         try:
+            if self._local is not None:
+                self._local.loop.add_callback(_replace_ended, self._local)
             return len(self._client.nthreads())
         except (OSError, RuntimeError, AttributeError) as error:  # as Dask has it between losing and closing
             raise self._lost() from error
@@ -184,7 +189,15 @@ def open_cluster(
             client = stack.enter_context(distributed.Client(connected, security=connected.security))
         else:
             client = stack.enter_context(_connect(distributed, address))
-        yield Cluster(client, address, warn)
+        yield Cluster(client, address, warn, connected if address == LOCAL else None)
+
+
+def _replace_ended(cluster: Any) -> None:
+    """Start workers in place of those that were killed while they started, which Dask does not start again."""
+    for name, worker in [*cluster.workers.items()]:
+        if worker.status.name in ("closed", "failed"):
+            del cluster.workers[name]
+    cluster.scale(len(cluster.worker_spec))
 
 
 def _connect(distributed: Any, address: str) -> AbstractContextManager[Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Sequence
 from functools import partial
@@ -446,6 +447,15 @@ def _parse_region_rule(rule: str) -> RegionRule:
         raise UsageError(f"the region rule {rule!r:.200} is not known: the rules are {REGION_FORMS}")
     _check_region_numbers(rule, kind, numbers)
     return RegionRule(kind, numbers, path or None, name.strip() or None)
+
+
+def locate_region_rule(rule: str, folder: str) -> str:
+    """Return a region rule whose file is named by its full path, which starts at `folder`."""
+    parsed = _parse_region_rule(rule.strip())
+    if parsed.path is None:
+        return rule
+    parts = (parsed.kind, *parsed.numbers, os.path.join(folder, parsed.path), parsed.name)
+    return ":".join(str(part) for part in parts if part is not None)
 
 
 def _check_region_numbers(rule: str, kind: str, numbers: tuple[float, ...]) -> None:

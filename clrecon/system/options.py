@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, field, fields
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
+
+from clrecon.errors import UsageError
 
 _KEY = "option"
 _READERS = {"int": int, "int | None": int, "float": float, "float | None": float}
 """What reads the value of a field, by its annotation; of others the text is the value."""
+
+
+Settings = TypeVar("Settings")
+
+_FLAGS = {"yes": True, "no": False, "true": True, "false": False, "1": True, "0": False}
 
 
 class Option(NamedTuple):
@@ -56,12 +63,61 @@ def option_beside(name: str, declared: Any) -> Option:
     return Option(name, flags, how)
 
 
-def options_of(settings: type, group: str = "") -> Iterator[Option]:
+def options_of(settings: type, group: str | None = "") -> Iterator[Option]:
+    """Yield the options of a group, for None those of all groups."""
     for item in fields(settings):
         flags, declared, how = item.metadata.get(_KEY, ([], None, {}))
-        if declared == group:
+        if flags and group in (None, declared):
             read = _READERS.get(str(item.type))
             yield Option(item.name, flags, how if read is None else {"type": read, **how})
+
+
+def pick_fields(settings: type, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Pick the values that are fields of settings and not None; those that may be given again make a tuple."""
+    picked = {own.name: given.get(own.name) for own in fields(settings)}
+    return {
+        name: tuple(value) if isinstance(value, list) else value for name, value in picked.items() if value is not None
+    }
+
+
+def make_part(part: type[Settings], given: Mapping[str, Any], owner: str | None, needs: str) -> Settings | None:
+    """Make settings that mean nothing without the option of `owner`, None where it has no value; `needs` says which."""
+    if owner is not None:
+        return part(**pick_fields(part, given))
+    for declared in options_of(part):
+        if given.get(declared.name) is not None:
+            raise UsageError(f"{declared.flags[0]} {needs}")
+    return None
+
+
+def read_value(read: Callable[[str], Any] | None, text: str, unit: object = None) -> Any:
+    """Read a value from text; a ValueError is the refusal.  What is no number is said with the unit it does without."""
+    try:
+        return text if read is None else read(text)
+    except UsageError:  # it says all by itself
+        raise
+    except ValueError as error:
+        reason = str(error)
+        if read in (int, float):
+            number = "whole number" if read is int else "number"
+            advice = ": write the length in mm, without a unit" if unit == "MM" else ""
+            reason = f"{text!r:.80} is no {number}{advice}"
+        raise ValueError(reason) from None
+
+
+def read_cell(declared: Option, text: str) -> Any:
+    """Read the value of an option from a cell of a table: yes or no for a flag, and | between values of a list."""
+    how = declared.how
+    action, word = how.get("action", ""), text.lower()
+    if action in ("store_true", "store_false", "yes-no"):
+        if word not in _FLAGS:
+            raise ValueError(f"{text!r:.40} is neither yes nor no")
+        return _FLAGS[word] is not (action == "store_false")
+    if word == "yes" and how.get("nargs") == "?":
+        return how["const"]
+    parts = [part.strip() for part in text.split("|")] if action == "append" else [text]
+    values = [read_value(how.get("type"), part, how.get("metavar")) for part in parts]
+    return tuple(values) if action == "append" else values[0]
 
 
 def parse_numbers(text: str, *, ends: bool = False) -> tuple[float, ...] | None:

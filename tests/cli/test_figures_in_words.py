@@ -398,7 +398,6 @@ def test_mesh_is_measured_where_its_figures_are_reported_or_printed(
         raise UsageError("enough")
 
     monkeypatch.setattr("clrecon.jobs.mesh.job.make_mesh", make_mesh)
-    monkeypatch.setattr(mesh_command, "mesh_fields", lambda options: {})
     paths = {"input": "a", "output": "b.stl", "report": None, "store": None}
     options = {**paths, "json": False, "verbose": False, "no_clobber": False}
     with refused(UsageError, "enough"):

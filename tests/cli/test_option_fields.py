@@ -9,10 +9,10 @@ from importlib import import_module
 import pytest
 from refusals import refused
 
-from clrecon.cli.common import Parser, add_fields, make_part, make_settings
+from clrecon.cli.common import Parser, add_fields, make_settings
 from clrecon.cli.main import COMMANDS
 from clrecon.errors import UsageError
-from clrecon.system.options import option
+from clrecon.system.options import make_part, option
 
 
 def read_even(text: str) -> int:
@@ -92,13 +92,13 @@ def test_part_of_settings_is_made_where_the_option_that_it_is_about_is_given(
     words: list[str], part: Part | None, part_parser: Parser
 ) -> None:
     given = part_parser.parse_args(words)
-    assert make_part(Part, given, given.path, "is about labels") == part
+    assert make_part(Part, vars(given), given.path, "is about labels") == part
 
 
 def test_option_of_a_part_without_the_one_that_it_is_about_is_refused(part_parser: Parser) -> None:
     given = part_parser.parse_args(["--grow", "0"])
     with refused(UsageError, "--grow", "labels"):
-        make_part(Part, given, given.path, "is about labels")
+        make_part(Part, vars(given), given.path, "is about labels")
 
 
 @pytest.mark.parametrize("words", [["mesh", "ct", "-o", "a.stl"], ["view", "ct"]], ids=["mesh", "view"])

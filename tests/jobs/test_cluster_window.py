@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import CancelledError
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -155,3 +156,27 @@ def test_task_with_many_voxels_is_sent_without_advice_of_dask() -> None:
         [(sent, is_equal)] = cluster.run_tasks(np.array_equal, [voxels], voxels[:3])
     assert sent is voxels
     assert not is_equal
+
+
+class OwnWorkers:
+    """Two workers of Dask's local cluster, of which it has closed the first, and started none in its place."""
+
+    def __init__(self) -> None:
+        self.loop = SimpleNamespace(add_callback=lambda function, *given: function(*given))
+        self.worker_spec = {0: {}, 1: {}}
+        self.workers = {0: SimpleNamespace(status=SimpleNamespace(name="closed"))} | {
+            1: SimpleNamespace(status=SimpleNamespace(name="running"))
+        }
+
+    def scale(self, count: int) -> None:
+        """Start what is missing, as `distributed.SpecCluster` does."""
+        for name in [*self.worker_spec][:count]:
+            self.workers.setdefault(name, SimpleNamespace(status=SimpleNamespace(name="new")))
+
+
+def test_own_worker_that_dask_has_given_up_is_replaced_and_the_other_stays() -> None:
+    local = OwnWorkers()
+
+    Cluster(FakeClient(), "local", warn=lambda text: None, local=local).count_workers()
+
+    assert {name: worker.status.name for name, worker in local.workers.items()} == {0: "new", 1: "running"}

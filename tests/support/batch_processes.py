@@ -5,13 +5,17 @@ from __future__ import annotations
 import subprocess
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 
 def children_of(parent: int) -> list[int]:
     """Numbers of the processes that a process has started."""
-    tasks = Path(f"/proc/{parent}/task")
-    return [int(word) for task in tasks.iterdir() for word in (task / "children").read_text().split()]
+    children: list[int] = []
+    for task in Path(f"/proc/{parent}/task").iterdir():
+        with suppress(FileNotFoundError, ProcessLookupError):  # a thread that has just ended
+            children += map(int, (task / "children").read_text().split())
+    return children
 
 
 def wait_until(process: subprocess.Popen[str], has_happened: Callable[[], bool]) -> None:

@@ -13,8 +13,7 @@ from house import ROOT
 from refusals import assert_one_line, refused
 
 from clrecon.errors import ClreconError, RefusedInputError, UsageError
-from clrecon.jobs.batch.plan import read_cases
-from clrecon.jobs.options import ScanSettings
+from clrecon.jobs.batch.plan import Plan, read_cases
 from clrecon.labels import read_labels
 from clrecon.proof.phantom import PhantomSettings, write_phantom
 from clrecon.reading import list_series, read_volume
@@ -30,7 +29,7 @@ READERS: dict[str, Callable[..., object]] = {
     "labels": read_labels,
     "curve": read_curve_points,
     "transfer function": load_transfer_function,
-    "manifest": lambda path: read_cases(path, ScanSettings()),
+    "manifest": lambda path: read_cases(path, Plan(output="out")),
 }
 
 

@@ -154,7 +154,7 @@ def _fill_folder(case: Case, plan: Plan, run: Run, folder: Path, key: str | None
     from clrecon.jobs.mesh.refinement import find_failed
     from clrecon.jobs.mesh.surfaces import names_level
 
-    settings, asked = plan.settings_of(case), plan.batch
+    settings, asked = plan.settings_of(case), plan.outputs_of(case)
     shared = None if (case.labels, asked.cloud, plan.drawer) == (None, None, None) else SharedScan()
     mesh = make_mesh(case.source, folder / f"mesh{asked.format}", settings, measure=asked.measure, shared=shared)
     run.lap("mesh")
@@ -175,9 +175,9 @@ def _fill_folder(case: Case, plan: Plan, run: Run, folder: Path, key: str | None
         run.lap("cloud")
     if shared is not None and plan.drawer is not None:
         draw = resolve_name(plan.drawer)
-        scan = MeshSettings(**_settings_in(settings, InputSettings))
+        shown = MeshSettings(**_settings_in(settings, InputSettings))
         how = {"size": _PICTURE_SIZE, "carried": plan.carried, "read": shared.read}
-        warnings += draw(case.source, case.labels, scan, folder / PICTURE, **how)
+        warnings += draw(case.source, case.labels, shown, folder / PICTURE, **how)
         run.lap("picture")
     elif asked.picture:
         warnings += _take_pictures(folder, asked, settings)

@@ -13,7 +13,6 @@ from clrecon.jobs.batch.case import DONE, LOST, fail_case, read_report
 from clrecon.jobs.batch.cohort import MISSING, write_cohort
 from clrecon.jobs.batch.plan import PAGE, TABLE, Case, Plan, check_places
 from clrecon.jobs.batch.scheduler import DaskScheduler, LocalScheduler, Outcome, Scheduler
-from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.outputs import check_files
 from clrecon.jobs.run import JobReport, Run
 from clrecon.system.arguments import name_parameter
@@ -117,19 +116,10 @@ def _check_choice(plan: Plan) -> None:
         raise UsageError(f"{' and '.join(given)} say different things of cases that are there: take one of them")
     if plan.batch.devices is not None and plan.device is not None:
         raise UsageError(f"{name_parameter('devices', 'D,D')} names the devices: leave {name_parameter('device')} out")
-    if plan.batch.cloud is not None and not all(map(_has_one_level, filter(None, (plan.plain, plan.labelled)))):
-        raise UsageError(
-            f"{name_parameter('cloud')} is of one iso value: give one in {name_parameter('iso_value')}, without ranges,"
-            f" {name_parameter('below')} and surfaces of the labels themselves"
-        )
     if plan.batch.collect and plan.batch.part is not None:
         raise UsageError(
             f"{name_parameter('collect', True)} is about all cases: leave {name_parameter('part', 'I/N')} out"
         )
-
-
-def _has_one_level(settings: MeshSettings) -> bool:
-    return settings.below is None and len(settings.levels) == 1 and isinstance(settings.levels[0], int | float)
 
 
 def _open_output(plan: Plan, cases: Sequence[Case]) -> Path:

@@ -17,16 +17,25 @@ from clrecon.errors import NoDicomError, UsageError
 from clrecon.exchange.formats import CLOUD_FORMATS, MESH_INPUTS
 from clrecon.jobs.cluster import LOCAL
 from clrecon.jobs.devices import check_indexes, list_usable
+from clrecon.jobs.mesh.purposes import settings_from
 from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
-from clrecon.jobs.options import ALL_DEVICES, DeviceSettings, ScanSettings, scheduler_option, view_option
+from clrecon.jobs.options import (
+    ALL_DEVICES,
+    ScanSettings,
+    locate_region_rule,
+    parse_region_rules,
+    scheduler_option,
+    view_option,
+)
 from clrecon.reading import tell_format
 from clrecon.reading.sources import open_remote
 from clrecon.reading.urls import check_url, is_url, refuse_url
 from clrecon.system.arguments import DirectionName, name_parameter
-from clrecon.system.light_dataclass import asdict, dataclass, fields, replace
-from clrecon.system.options import option
+from clrecon.system.light_dataclass import asdict, dataclass, field, fields, replace
+from clrecon.system.options import option, options_of, pick_fields, read_cell
 from clrecon.system.packages import import_package
 from clrecon.system.paths import open_regular, shown_path
+from clrecon.system.progress import DEFAULT_SECONDS
 from clrecon.system.text import escape_text, guess_word, unknown_name
 from clrecon.version import package_version
 
@@ -191,30 +200,29 @@ class BatchSettings:
 
 
 class Case(NamedTuple):
-    """A row of a manifest, or a series of a folder."""
+    """A row of a manifest, or a series of a folder; `cells` are options of its own, each a pair of name and text."""
 
     name: str
     source: str
-    series: str | None
-    labels: str | None
+    labels: str | None = None
+    cells: Sequence[Sequence[str]] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
     """What a worker needs to know of the whole batch, and what the key of a case counts.
 
-    plain, labelled: Settings of the meshes of cases without and with a label map, whose path each case has itself.
+    given: Options of the meshes by their names, see `clrecon.jobs.mesh.purposes.settings_from`; a case's own win.
     options: Names of parameters in the messages of a worker, see `OptionSpeaker`; None: as in Python.
     carried: The saved view as JSON, what of it holds for all cases; it is drawn by `drawer`, a function ("module:name")
         that is called as `draw_carried`.
     """
 
     output: str
-    batch: BatchSettings
-    plain: MeshSettings | None = None
-    labelled: MeshSettings | None = None
+    batch: BatchSettings = BatchSettings()
+    given: Mapping[str, Any] = field(default_factory=dict)
     options: Mapping[str, str] | None = None
-    timeout: float
+    timeout: float = DEFAULT_SECONDS
     no_clobber: bool = False
     drawer: str | None = None
     carried: str | None = None
@@ -225,24 +233,30 @@ class Plan:
     @classmethod
     def from_json(cls, text: str) -> Plan:
         values = _with_tuples(json.loads(text))
-        for kind in ("plain", "labelled"):
-            if values[kind] is not None:
-                labels = values[kind]["labels"]
-                values[kind]["labels"] = None if labels is None else LabelChoice(**labels)
-                values[kind] = MeshSettings(**values[kind])
         return cls(**values | {"batch": BatchSettings(**values["batch"])})
 
     @property
     def device(self) -> str | None:
-        return (self.plain or self.labelled or DeviceSettings()).device
+        return self.given.get("device")
 
     def settings_of(self, case: Case) -> MeshSettings:
-        settings = self.plain if case.labels is None else self.labelled
-        assert settings is not None  # made for each kind of row that there is
-        if case.labels is not None:
-            assert settings.labels is not None
-            settings = replace(settings, labels=replace(settings.labels, path=case.labels))
-        return settings if case.series is None else replace(settings, series=case.series)
+        cells = _read_cells(case)
+        replaced = _LEVELS if _LEVELS & cells.keys() else ()  # one level takes the place of another
+        given = {name: value for name, value in self.given.items() if name not in replaced}
+        return settings_from({**given, **cells, "path": case.labels}, "in the column labels of each row")
+
+    def outputs_of(self, case: Case) -> BatchSettings:
+        return replace(self.batch, **pick_fields(BatchSettings, _read_cells(case)))
+
+    def check(self, case: Case) -> None:
+        """Refuse the options of a case where they cannot be together, or name no value."""
+        settings, outputs = self.settings_of(case), self.outputs_of(case)
+        levels = () if settings.below is not None else settings.levels
+        if outputs.cloud is not None and (len(levels) != 1 or isinstance(levels[0], tuple)):
+            raise UsageError(
+                f"{name_parameter('cloud')} is of one iso value: give one in {name_parameter('iso_value')}, without"
+                f" ranges, {name_parameter('below')} and surfaces of the labels themselves"
+            )
 
     def folder_of(self, case: Case) -> Path:
         return Path(self.output, case.name)
@@ -258,22 +272,21 @@ def _with_tuples(value: Any) -> Any:
 _FORMAT = 2
 """Rises when files of a case change their names or their meaning."""
 
-_ANY_MACHINE = ("device", "memory", "labels")
-"""Settings that change nothing of what is made; the label map counts by its files, and by the choice of labels."""
-
 
 def make_key(case: Case, plan: Plan) -> str:
     """Return a hash of the version, of all settings that matter, and of names, sizes and times of the files read.
 
     The server of a URL is asked for them, of DICOMweb for the UIDs of the instances, which change with the content.
     """
-    settings = plan.settings_of(case)
+    settings, batch = plan.settings_of(case), plan.outputs_of(case)
+    rules = parse_region_rules(settings.region or ())
     values = {own.name: getattr(settings, own.name) for own in fields(settings) if own.name not in _ANY_MACHINE}
+    values["region"] = [str(rule) for rule in rules]
     labels = None if settings.labels is None else replace(settings.labels, path="")
-    outputs = [getattr(plan.batch, name) for name in ("format", "mesh", "measure", "cloud", "picture", "views")]
+    outputs = [getattr(batch, own.name) for own in options_of(BatchSettings, "make") if own.name != "state"]
     asked = (_FORMAT, package_version(), values, labels, outputs, *filter(None, [plan.carried]))
     digest = hashlib.sha256(repr(asked).encode("utf-8", "replace"))
-    for path in filter(None, (case.source, case.labels)):
+    for path in filter(None, (case.source, case.labels, *(rule.path for rule in rules))):
         remote = open_remote(path).list_entries() if is_url(path) else None
         for name, size, version in remote or _list_files(path, follow_links=settings.follow_links):
             digest.update(f"{name}\0{size}\0{version}\n".encode("utf-8", "surrogateescape"))
@@ -294,31 +307,56 @@ def _list_files(path: str, *, follow_links: bool) -> Iterator[tuple[str, int, in
             yield os.path.relpath(file, path), status.st_size, status.st_mtime_ns
 
 
-COLUMNS = ("case", "input", "series", "labels")
+_ANY_MACHINE = ("device", "memory", "scheduler", "labels")
+"""Settings that change nothing of what is made; the label map counts by its files, and by the choice of labels."""
+
+_OPTIONS = {
+    own.flags[0].removeprefix("--"): own
+    for own in chain(options_of(MeshSettings, None), options_of(LabelChoice, None), options_of(BatchSettings, "make"))
+    if own.name not in (*_ANY_MACHINE, "path", "state")
+}
+"""Options that a column of a manifest gives for each case, by the names of their columns."""
+
+_LEVELS = {own.name for own in options_of(MeshSettings, "level")}
+
+COLUMNS = ("case", "input", "labels")
+
+
+def _read_cells(case: Case) -> dict[str, Any]:
+    """Return the values of a case's own options, by the names of fields."""
+    values = {}
+    for column, text in case.cells:
+        try:
+            values[_OPTIONS[column].name] = read_cell(_OPTIONS[column], text)
+        except ValueError as error:
+            raise UsageError(f"column {column}: {error}") from None
+    return values
+
+
 TABLE, PAGE = "cohort.csv", "cohort.html"
 REPORT = "case.json"
 
 _NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]{0,98}[A-Za-z0-9_-])?")
 
 
-def read_cases(manifest: str | Path, selection: ScanSettings) -> list[Case]:
-    """Read the rows of a CSV file, or find the series of a folder, in order."""
+def read_cases(manifest: str | Path, plan: Plan) -> list[Case]:
+    """Read the rows of a CSV or Parquet file, or find the series of a folder, in order; all have settings that work."""
     refuse_url(manifest, "manifest")
-    return _find_series(manifest, selection) if os.path.isdir(manifest) else _read_table(manifest)
+    return _find_series(manifest, plan) if os.path.isdir(manifest) else _read_table(manifest, plan)
 
 
-def _read_table(path: str | Path) -> list[Case]:
+def _read_table(path: str | Path, plan: Plan) -> list[Case]:
     name, folder = escape_text(os.path.basename(path)), os.path.dirname(os.path.abspath(path))
     try:
         if os.path.splitext(path)[1].lower() == ".parquet":
-            cases = _read_parquet(name, path, folder)
+            cases = _read_parquet(name, path, folder, plan)
         else:
             with io.TextIOWrapper(open_regular(path), "utf-8-sig", newline="") as stream:
                 delimiter = ";" if ";" in stream.readline() else ","  # no name of a column has one
                 stream.seek(0)
                 table = csv.reader(stream, delimiter=delimiter, strict=True)
                 places = _find_columns(name, next(table, []))
-                cases = _read_rows(name, ((table.line_num, row) for row in table), places, folder)
+                cases = _read_rows(name, ((table.line_num, row) for row in table), places, folder, plan)
     except (UnicodeDecodeError, csv.Error) as error:
         reason = error if isinstance(error, csv.Error) else "it is no text in UTF-8"
         raise UsageError(
@@ -331,7 +369,7 @@ def _read_table(path: str | Path) -> list[Case]:
     return cases
 
 
-def _read_parquet(name: str, path: str | Path, folder: str) -> list[Case]:
+def _read_parquet(name: str, path: str | Path, folder: str, plan: Plan) -> list[Case]:
     """Read the rows of a Parquet file, which count as the lines of a table below its line of columns."""
     parquet = import_package("pyarrow.parquet", "a manifest in Parquet")
     with open_regular(path) as stream:
@@ -339,38 +377,54 @@ def _read_parquet(name: str, path: str | Path, folder: str) -> list[Case]:
             table = parquet.ParquetFile(stream)
             places = _find_columns(name, table.schema_arrow.names)
             rows = chain.from_iterable(batch.to_pylist() for batch in table.iter_batches(1000))
-            cells = (["" if cell is None else str(cell) for cell in row.values()] for row in rows)
-            return _read_rows(name, enumerate(cells, start=2), places, folder)
+            cells = ([*map(_write_cell, row.values())] for row in rows)
+            return _read_rows(name, enumerate(cells, start=2), places, folder, plan)
         except (ValueError, OSError) as error:  # as pyarrow's errors are
             if isinstance(error, UsageError):
                 raise
             raise UsageError(f"the manifest {name} is no table in Parquet: {error!s:.200}") from None
 
 
+def _write_cell(cell: Any) -> str:
+    """Return a cell of Parquet as that of a text: nothing is None or NaN, and whole numbers are without decimals."""
+    if cell is None or cell != cell:
+        return ""
+    return str(int(cell)) if isinstance(cell, float) and cell.is_integer() else str(cell)
+
+
 def _find_columns(name: str, header: Sequence[str]) -> dict[str, int]:
     """Return the place of each column, by the first line of a table."""
-    words = [word.strip() for word in header]
-    unknown = [word for word in words if word not in COLUMNS]
+    words = [word.strip().lower().removeprefix("--").replace("_", "-") for word in header]
+    known = (*COLUMNS, *_OPTIONS)
+    unknown = [word for word in words if word not in known]
     if unknown:
-        shown = ", ".join(f"{word!r:.60}{guess_word(word, COLUMNS)}" for word in unknown[:5])
-        raise UsageError(f"the manifest {name} has unknown columns: {shown}; there are {', '.join(COLUMNS)}")
-    missing = [word for word in COLUMNS[:2] if word not in words]
-    if missing or len(set(words)) < len(words):
-        wrong = f"no column {' and no column '.join(missing)}" if missing else "a column twice"
+        shown = ", ".join(f"{word!r:.60}{guess_word(word, known)}" for word in unknown[:5])
         raise UsageError(
-            f"the manifest {name} has {wrong}: its first line is {','.join(COLUMNS)}, the last two optional"
+            f"the manifest {name} has unknown columns: {shown}; there are {', '.join(COLUMNS)} and options of"
+            " the command without their dashes, such as hu or keep-largest"
         )
+    missing = [word for word in COLUMNS[:2] if word not in words]
+    twice = [word for word in words if words.count(word) > 1]
+    if missing or twice:
+        wrong = f"no column {' and no column '.join(missing)}" if missing else f"the column {twice[0]} twice"
+        raise UsageError(f"the manifest {name} has {wrong}: its first line names the columns, as case,input,hu")
     return {word: place for place, word in enumerate(words)}
 
 
-def _read_rows(name: str, rows: Iterable[tuple[int, Sequence[str]]], places: dict[str, int], folder: str) -> list[Case]:
+def _read_rows(
+    name: str, rows: Iterable[tuple[int, Sequence[str]]], places: dict[str, int], folder: str, plan: Plan
+) -> list[Case]:
     lines: dict[str, int] = {}
+    checked: dict[tuple[bool, Any], Any] = {}
     cases: list[Case] = []
     for line, row in rows:
         if not any(cell.strip() for cell in row):
             continue
         if len(row) != len(places):
-            raise UsageError(f"line {line} of the manifest {name} has {len(row)} cells, its first line {len(places)}")
+            raise UsageError(
+                f"line {line} of the manifest {name} has {len(row)} cells, its first line {len(places)}: put a cell"
+                " with commas into quotes"
+            )
         cells = {column: row[place].strip() for column, place in places.items()}
         case = cells["case"]
         if not _NAME.fullmatch(case) or case.lower() in (TABLE, PAGE):
@@ -386,9 +440,15 @@ def _read_rows(name: str, rows: Iterable[tuple[int, Sequence[str]]], places: dic
         try:
             refuse_url(cells.get("labels"), "label map")
             source, labels = (_find_path(folder, cells.get(column, "")) for column in ("input", "labels"))
+            if rules := cells.get("region"):
+                cells["region"] = "|".join(locate_region_rule(rule, folder) for rule in rules.split("|"))
+            options = tuple(cell for cell in cells.items() if cell[0] in _OPTIONS and cell[1])
+            if (labels is None, options) not in checked:
+                plan.check(Case(case, source or "", labels, options))
         except UsageError as error:
             raise UsageError(f"line {line} of the manifest {name}: {error}") from None
-        cases.append(Case(case, source or "", cells.get("series") or None, labels))
+        options = checked.setdefault((labels is None, options), options)  # one for all equal ones
+        cases.append(Case(case, source or "", labels, options))
     return cases
 
 
@@ -400,10 +460,12 @@ def _find_path(folder: str, text: str) -> str | None:
     return os.path.join(folder, text) if text else None
 
 
-def _find_series(folder: str | Path, selection: ScanSettings) -> list[Case]:
+def _find_series(folder: str | Path, plan: Plan) -> list[Case]:
     """Return a case for each stack of CT slices below a folder, by its number: names of folders can be patients'."""
     from clrecon.reading.dicom.reader import list_stacks
 
+    plan.check(Case("", str(folder)))
+    selection = ScanSettings(**pick_fields(ScanSettings, plan.given))
     if selection.series is not None:
         raise UsageError(
             f"each series of a folder is a case: leave {name_parameter('series')} out, or write a manifest"
@@ -415,7 +477,10 @@ def _find_series(folder: str | Path, selection: ScanSettings) -> list[Case]:
             f" {', '.join(COLUMNS)}"
         )
     width = max(3, len(str(stacks[-1].number)))
-    return [Case(f"series-{stack.number:0{width}d}", str(stack.folder), stack.series, None) for stack in stacks]
+    return [
+        Case(f"series-{stack.number:0{width}d}", str(stack.folder), cells=(("series", stack.series),))
+        for stack in stacks
+    ]
 
 
 def check_places(cases: Sequence[Case], output: str | Path) -> None:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
-from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.mesh.seeds import is_label_seed
+from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.jobs.mesh.surfaces import Part
 from clrecon.jobs.presets import HIGHEST_BONE_HU, LOWEST_BONE_HU, find_purpose
 from clrecon.system.arguments import name_parameter
+from clrecon.system.options import make_part, pick_fields
 from clrecon.system.text import count_of, format_ml
 
 if TYPE_CHECKING:
@@ -52,6 +54,30 @@ def settings_for(name: str | None, given: dict[str, Any]) -> dict[str, Any]:
         fields["preprocess"] += ",region"  # the paper's order
     defaults = {field: value for field, value in fields.items() if not given.get(field)}
     return {**given, **defaults, "purpose": name}
+
+
+def mesh_fields(options: Mapping[str, Any], labels_by: str = "") -> dict[str, Any]:
+    """Return the fields of `MeshSettings` that options give, by their names, None for those that are not given.
+
+    A message says `labels_by` what a label map comes: by default its option.
+    """
+    given = pick_fields(MeshSettings, options)
+    given |= given.pop("iso_value", {})  # one of two fields
+    needs = f"says how labels become meshes: give their file {labels_by or 'with ' + name_parameter('labels', 'FILE')}"
+    if given.get("surface") == "cortex":  # labels pick the cells, as with hu
+        options = {**options, "surface": "hu"}
+    labels = make_part(LabelChoice, options, options.get("path"), needs)
+    if labels is not None:
+        given["labels"] = labels
+        if given.get("solid") and not any(map(is_label_seed, given.get("grow_from", ()))):
+            del given["solid"]  # it says how each label becomes a mesh
+    return given
+
+
+def settings_from(options: Mapping[str, Any], labels_by: str = "") -> MeshSettings:
+    """Make the settings of options, with those of their purpose; see `mesh_fields` and `settings_for`."""
+    given = mesh_fields(options, labels_by)
+    return MeshSettings(**settings_for(given.pop("purpose", None), given))
 
 
 def _without_parts(given: dict[str, Any]) -> MeshSettings:

@@ -104,10 +104,10 @@ def test_row_of_a_case_in_the_table_has_the_figures_of_its_report(cohort: Path) 
 def test_case_with_cloud_and_two_views_without_a_mesh_has_these_files_and_the_cloud_of_the_command(
     cohort: Path, tmp_path: Path
 ) -> None:
-    (tmp_path / "m.csv").write_text(f"case,input\nA,{cohort / 'ball1'}\n")
-    options = ["--cloud", "ply", "--no-mesh", "--view", "left,anterior"]
+    (tmp_path / "m.csv").write_text(f"case,input,hu,cloud\nA,{cohort / 'ball1'},0,ply\n")
+    options = ["--no-mesh", "--view", "left,anterior"]
 
-    assert main(["batch", str(tmp_path / "m.csv"), "-o", str(tmp_path / "out"), "--hu", "0", "-q", *options]) == 0
+    assert main(["batch", str(tmp_path / "m.csv"), "-o", str(tmp_path / "out"), "--hu", "50", "-q", *options]) == 0
 
     files = files_of(tmp_path / "out" / "A")
     assert {*files} == {"case.json", "cloud.ply", "picture_anterior.png", "picture_left.png"}

@@ -13,8 +13,6 @@ from web_servers import Archive, running
 from clrecon.errors import UsageError
 from clrecon.jobs.batch.case import Answer, make_case
 from clrecon.jobs.batch.plan import BatchSettings, Case, Plan, check_places, make_key, read_cases
-from clrecon.jobs.mesh.settings import MeshSettings
-from clrecon.jobs.options import ScanSettings
 
 URL = "dicomweb+https://pacs.example/studies/1.2/series/3.4"
 
@@ -22,7 +20,7 @@ URL = "dicomweb+https://pacs.example/studies/1.2/series/3.4"
 def read_table(folder: Path, *rows: str, columns: str = "case,input") -> list[Case]:
     """Read the cases of a manifest with these lines."""
     (folder / "m.csv").write_text("\n".join([columns, *rows]))
-    return read_cases(folder / "m.csv", ScanSettings())
+    return read_cases(folder / "m.csv", Plan(output="out"))
 
 
 def test_url_of_a_manifest_stays_as_it_is_beside_a_path(tmp_path: Path) -> None:
@@ -50,11 +48,11 @@ def test_wrong_url_of_a_manifest_is_refused_with_its_line_and_no_password(what: 
 
 def test_manifest_behind_a_url_is_refused() -> None:
     with refused(UsageError, "manifest"):
-        read_cases("s3://bucket/cohort.csv", ScanSettings())
+        read_cases("s3://bucket/cohort.csv", Plan(output="out"))
 
 
 def case_of(url: str, name: str = "a") -> Case:
-    return Case(name, source=url, series=None, labels=None)
+    return Case(name, source=url)
 
 
 def test_url_lies_in_no_folder_of_the_output_but_a_path_of_its_words_does(
@@ -78,7 +76,7 @@ def archive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Archive
 
 def plan_of(folder: Path, *, resume: bool = False) -> Plan:
     batch = BatchSettings(picture=False, measure=False, resume=resume)
-    return Plan(output=str(folder), batch=batch, plain=MeshSettings(iso_value=0.0), timeout=60)
+    return Plan(output=str(folder), batch=batch, given={"iso_value": {"iso_value": 0.0}}, timeout=60)
 
 
 def test_key_of_a_case_changes_with_the_instances_of_its_archive(archive: Archive, tmp_path: Path) -> None:
