@@ -51,7 +51,7 @@ LEAST_ROOM = 2
 """Samples outside of a vertex that belong to its wall, at least."""
 
 MOST_SHIFT_MM = 2.5
-"""Largest shift of a vertex to its wall; a fit with a larger shift counts as bad."""
+"""Largest shift of a vertex to its wall; a fit with a larger shift, or standard error, counts as bad."""
 
 _WEIGHT_FACTOR, _LEAST_WEIGHED = 1.125, 0.054
 """By what the fit's own error is multiplied where it weighs neighbours, and what is added in squares, in blurs."""
@@ -141,9 +141,8 @@ def fit_walls(
                 rise = np.minimum(LEAST_CONTRAST, _FAINT_MM / blurs) * (known.cortex_hu - around_hu)
                 shows_bone[rows] = walls.peak_hu >= np.minimum(around_hu + rise, FAINT_HU)
                 fit.hidden[rows] = hidden & (fit.states[rows] == BADLY_FITTED)
-                is_solid = walls.inner_hu > SOLID_SHARE * walls.cortex_hu
-                depth_mm = np.float32(-sampler.scale.first_mm)
-                fit.thickness_mm[rows] = np.maximum(walls.thickness_mm, np.where(is_solid, depth_mm, np.float32(0.0)))
+                solid_mm = np.float32(-sampler.scale.first_mm) * (walls.inner_hu > SOLID_SHARE * walls.cortex_hu)
+                fit.thickness_mm[rows] = np.maximum(walls.thickness_mm, solid_mm)
                 fit.shift_mm[rows], fit.room_mm[rows] = walls.shift_mm, walls.room_mm
                 fit.spread_mm[rows] = standard_errors(walls, known)
                 steps = sampler.frame.steps_along(normals[rows], frames[1, span])
@@ -151,6 +150,7 @@ def fit_walls(
                 fit.error_mm[rows] = standard_errors(walls, known, coarse_mm=steps * ratios * ratios)
                 if denser is not None:
                     fit.error_mm[rows] = np.hypot(fit.error_mm[rows], DENSER_ERROR * (denser[span] - walls.shift_mm))
+    fit.states[(fit.states == FITTED) & (fit.error_mm > MOST_SHIFT_MM)] = BADLY_FITTED
     is_wall = np.isin(fit.states, (FITTED, BADLY_FITTED))
     is_far = is_wall & ~lie_near(points, shows_bone, near_mm(resident.volume) / _CELLS_NEAR, _CELLS_NEAR)
     fit.states[is_far], fit.hidden[is_far] = NOT_BONE, False

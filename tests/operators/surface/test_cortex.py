@@ -303,6 +303,14 @@ def test_walls_unlike_the_cortex_of_the_scan_have_errors_larger_by_a_factor_and_
     np.testing.assert_allclose(standard_errors(wall, constants), factor * standard_errors(usual, constants), rtol=1e-5)
 
 
+@pytest.mark.parametrize(("noise_hu", "error_mm", "state"), [(300.0, 0.95, "fitted"), (700.0, 3.1, "badly fitted")])
+def test_walls_with_standard_errors_above_2_5_mm_are_badly_fitted(device, noise_hu, error_mm, state):
+    noisy = constants_with_blurs(within_mm=0.8, across_mm=0.8).changed(noise_hu=noise_hu)
+    _, fit = fit_surface(hollow_ball(thickness=1.0), device, constants=noisy)
+    assert np.median(fit.error_mm) == pytest.approx(error_mm, rel=0.1)
+    assert (fit.states == _STATES.index(state)).mean() > 0.9  # the walls of the cavity have no room, or are none
+
+
 THICK_SLICES = hollow_ball(thickness=1.0, spacing=(1.0, 1.0, 4.0))
 CONSTANTS_OF_THICK_SLICES = constants_with_blurs(within_mm=0.7, across_mm=2.0)
 
