@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any, BinaryIO, Protocol, cast
 
 import numpy as np
-from isal import igzip, isal_zlib
+from isal import igzip, igzip_threaded, isal_zlib
 from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError
@@ -265,10 +265,6 @@ def import_extra(module: str, purpose: str) -> Any:
     return import_package(module, f"this {purpose}")
 
 
-PACKING = 1
-"""Level of gzip, as nibabel has it.  Level 6 takes four times as long for a tenth of the bytes."""
-
-
 @dataclass(frozen=True, eq=False)
 class VolumeContent:
     """What a volume file holds: voxels (nk, nj, ni) int16, int32 or float32, affine, the certificate in ASCII lines."""
@@ -277,3 +273,19 @@ class VolumeContent:
     affine: Float64Array
     lines: tuple[str, ...]
     progress: Progress
+
+
+_ISAL_LEVEL = 3
+"""Level of ISA-L: files are 1 % smaller than those of level 1 of zlib, and packed in a quarter of the time."""
+
+
+def open_packer(stream: BinaryIO) -> Any:
+    """Return a file that packs by gzip into a stream, with a thread for each core."""
+    return igzip_threaded.open(stream, "wb", compresslevel=_ISAL_LEVEL, threads=-1)
+
+
+def write_slices(stream: Any, content: VolumeContent) -> None:
+    """Write the voxels, little endian."""
+    for k, layer in enumerate(content.voxels):
+        stream.write(layer.astype(layer.dtype.newbyteorder("<"), copy=False).tobytes())
+        content.progress("write", k + 1, len(content.voxels))

@@ -15,13 +15,14 @@ from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry.affine import Float64Array, checked_affine, compose_affine
 from clrecon.reading.grids.grid_file import (
     LABEL_MAP,
-    PACKING,
     VOLUME,
     GridFile,
     VolumeContent,
     VoxelBytes,
     file_beside,
     import_extra,
+    open_packer,
+    write_slices,
 )
 from clrecon.system.paths import open_regular
 from clrecon.system.text import escape_text
@@ -207,37 +208,8 @@ def _unit_scale(header: dict[str, Any], name: str) -> NDArray[np.float64]:
     return np.array(scales, dtype=np.float64)
 
 
-_CHUNK_BYTES = 2**20
-"""Bytes of voxels that pynrrd packs at a time, for the progress."""
-
-
-class _Undated(io.RawIOBase):
-    """Passes bytes on to a stream, but not the date that pynrrd writes: the same volume gives the same bytes."""
-
-    def __init__(self, stream: BinaryIO, content: VolumeContent):
-        super().__init__()
-        self._stream, self._progress = stream, content.progress
-        self._chunks = -(-content.voxels.nbytes // _CHUNK_BYTES)
-        self._in_header, self._done = True, 0
-
-    def writable(self) -> bool:
-        return True
-
-    def write(self, data: Any) -> int:
-        """Pass on what pynrrd writes: a line of the header, or a chunk of voxels."""
-        if self._in_header:
-            self._in_header = data != b"\n"  # an empty line ends the header
-            if data.startswith(b"# on "):
-                return len(data)
-        else:
-            self._done += 1
-            self._progress("write", min(self._done, self._chunks), self._chunks)
-        self._stream.write(data)
-        return len(data)
-
-
 def write_nrrd(stream: BinaryIO, content: VolumeContent) -> None:
-    """Write the file, its voxels packed by gzip."""
+    """Write the file: the header by pynrrd without its date, which packs slowly, and voxels packed by gzip."""
     nrrd = import_extra("nrrd", VOLUME)
     header = {
         "space": "left-posterior-superior",
@@ -249,6 +221,11 @@ def write_nrrd(stream: BinaryIO, content: VolumeContent) -> None:
         "encoding": "gzip",
         **{f"clrecon_{n:02}": line for n, line in enumerate(("HU", *content.lines))},
     }
-    voxels = content.voxels.astype(content.voxels.dtype.newbyteorder("<"), copy=False)
-    content.progress("write", 0, 0)
-    nrrd.write(_Undated(stream, content), voxels.transpose(2, 1, 0), header, compression_level=PACKING)
+    start = io.BytesIO()
+    nrrd.write(start, np.zeros((1, 1, 1), content.voxels.dtype.newbyteorder("<")), header)
+    lines = start.getvalue().partition(b"\n\n")[0].split(b"\n")
+    sizes = "sizes: {2} {1} {0}".format(*content.voxels.shape).encode()
+    fields = [sizes if line.startswith(b"sizes:") else line for line in lines if not line.startswith(b"# on ")]
+    stream.write(b"\n".join(fields) + b"\n\n")
+    with open_packer(stream) as packing:
+        write_slices(packing, content)
