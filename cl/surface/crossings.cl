@@ -3,23 +3,21 @@
  * Reference: Moeller 1997, "A fast triangle-triangle intersection test"; the bound of rounding is that of Shewchuk 1997,
  * "Adaptive precision floating-point arithmetic and fast robust geometric predicates", orient3d, doubled.
  *
- * A triangle belongs to the level whose rows are as wide as its box, or up to twice as wide, and to the row (y, z) that
- * holds the lowest corner of its box.  The entries of a row are sorted by that corner's x.  A box that overlaps the box
- * of an item at low, high therefore begins in the rows from low - edge to high, between low.x - edge and high.x:
+ * Space is cut into rows along x. A triangle is entered in each row that its box touches; the entries of a row are sorted
+ * by the lowest x of their boxes, in steps:
  *
  *     z   +-------+-------+
- *         |   +---|---+   |     rows of one edge; the item looks at those that its box, longer by an edge towards
- *         +---|---+---|---+     the lower end, touches
+ *         |   +---|---+   |     a box in four rows: it meets another one in the rows that both touch, and the pair counts
+ *         +---|---+---|---+     in the first of these along y and z, which is the first of one of them
  *         |   +---|---+   |
  *         +-------+-------+  y
  *
- * An item looks at the entries behind its own of its level, at those of the next level with shorter triangles, and at
- * those of longer ones beyond the next: each pair is seen once, and most triangles look for no longer ones.  Both of
- * its triangles are marked, by atomic_or(), unless float32 shows that they do not cut each other: signs of volumes
- * and areas that exceed their rounding are those of exact arithmetic.
+ * An item looks at the entries behind its own, up to those that begin behind its end.  Both triangles of a pair are
+ * marked, by atomic_or(), unless float32 shows that they do not cut each other, and in a row of their own where it shows
+ * that they do: signs of volumes and areas that exceed their rounding are those of exact arithmetic.
  *
- * Triangles that have moved since are entered once more, behind all others, in levels of their own; these items look at
- * all older levels, too.  What was entered before stays: a mark too many is found out by the exact look.
+ * Triangles that have moved since are entered once more, behind all others, in rows of a generation of their own; these
+ * items look at all older generations, too, of which what has moved does not count.
  *
  * LANES entries are looked at together: boxes, and sides of both planes, which leave few pairs. */
 #include "include/lanes.h"
@@ -27,9 +25,15 @@
 
 /* Share of a volume's sum of absolute terms that its rounding does not reach. */
 #define ROUNDING 0x1p-20f
-/* What boxes and rows are taken longer by, in edges: more than the rounding of coordinates in float32. */
-#define SLACK 1e-3f
+#define BOTH 3 /* along y and along z: an entry in the first row that its triangle touches */
+enum { APART, UNSURE, CUT }; /* what float32 tells of two triangles */
+#define NOWHERE 0x7fffffff /* behind all rows */
 
+/* Rows of the tables of entries: corners a, b, c of a triangle, x y z of each; and beside these. */
+#define PLACES 9
+#define NAMES 5
+#define FIRST_ROWS 3 /* 1: in the first row along y that its triangle touches, 2: along z */
+#define KEY 4 /* row * steps + step of the lowest x, which rises from entry to entry of a generation */
 
 /* The plane of a triangle: one corner, the normal, and for each of its parts the sum of its absolute terms. */
 typedef struct { float3 corner, normal, terms; } plane;
@@ -139,17 +143,20 @@ static inline int apart_in_shadow(
     return sum == 3 || sum == -3;
 }
 
-/* False where the line from p to q surely passes beside the triangle a, b, c, or where p and q lie on the same side. */
+/* APART where the line from p to q surely passes beside the triangle a, b, c, or where p and q lie on the same side; CUT
+ * where it surely passes through. */
 static inline int may_pass(
     const float3 p, const float3 q, const int side_p, const int side_q, const float3 a, const float3 b, const float3 c)
 {
     if (side_p == side_q && side_p != 0)
-        return 0;
+        return APART;
     const plane first = plane_of(p, q, a), second = plane_of(p, q, b), third = plane_of(p, q, c);
     const int u = side_of(&first, b), v = side_of(&second, c), w = side_of(&third, a);
     if ((u > 0 || v > 0 || w > 0) && (u < 0 || v < 0 || w < 0))
-        return 0;
-    return !apart_in_shadow(p, q, a, b, c);
+        return APART;
+    if (side_p * side_q < 0 && (u + v + w == 3 || u + v + w == -3))
+        return CUT;
+    return apart_in_shadow(p, q, a, b, c) ? APART : UNSURE;
 }
 
 /* True where triangles in one plane with the common edge b, c and the third corners a and d may lie on one side of it. */
@@ -187,42 +194,66 @@ static inline int3 common_corners(const uint3 one, const uint3 other)
     return -((one == other) | (one == other.yzx) | (one == other.zxy));
 }
 
-/* False where triangles surely have nothing in common but their common corners.  Of two with a common corner only the
- * edges opposite to it can pass through the other triangle. */
-static inline int may_cut(const triangle one, const triangle two)
+/* False where float32 cannot tell whether a triangle has an area. */
+static inline int has_area(const plane *flat)
+{
+    const int3 exceeds = fabs(flat->normal) > ROUNDING * flat->terms;
+    return exceeds.x || exceeds.y || exceeds.z;
+}
+
+/* APART where triangles surely have nothing in common but their common corners, CUT where an edge of one surely passes
+ * through the other.  Of two with a common corner only the edges opposite to it can. */
+static inline int compare_triangles(const triangle one, const triangle two)
 {
     const int3 common = common_corners(one.names, two.names), flags = common_corners(two.names, one.names);
     const int count = common.x + common.y + common.z;
     const triangle own = turned(one, count == 2 ? 1 - common : common), its = turned(two, count == 2 ? 1 - flags : flags);
     const float3 a = own.a, b = own.b, c = own.c, d = its.a, e = its.b, f = its.c;
     if (count == 2)
-        return may_be_folded(a, b, c, d);
+        return may_be_folded(a, b, c, d) ? UNSURE : APART;
     const plane here = plane_of(a, b, c), there = plane_of(d, e, f);
     const int our_a = side_of(&there, a), our_b = side_of(&there, b), our_c = side_of(&there, c);
     const int its_d = side_of(&here, d), its_e = side_of(&here, e), its_f = side_of(&here, f);
-    if (may_pass(b, c, our_b, our_c, d, e, f) || may_pass(e, f, its_e, its_f, a, b, c))
-        return 1;
-    return count == 0
-        && (may_pass(a, b, our_a, our_b, d, e, f) || may_pass(c, a, our_c, our_a, d, e, f)
-            || may_pass(d, e, its_d, its_e, a, b, c) || may_pass(f, d, its_f, its_d, a, b, c));
+    int found = max(may_pass(b, c, our_b, our_c, d, e, f), may_pass(e, f, its_e, its_f, a, b, c));
+    if (count == 0 && found != CUT) {
+        found = max(found, max(may_pass(a, b, our_a, our_b, d, e, f), may_pass(c, a, our_c, our_a, d, e, f)));
+        found = max(found, max(may_pass(d, e, its_d, its_e, a, b, c), may_pass(f, d, its_f, its_d, a, b, c)));
+    }
+    return found == CUT && !(has_area(&here) && has_area(&there)) ? UNSURE : found;
 }
 
-/* Entries from place on that may cut the triangle: its box overlaps theirs, and neither lies on one side of the other's
- * plane. */
-static inline ints not_apart(
-    __global const float *places, __global const uint *names, const uint stride, const uint place,
-    const ints counts, const triangle *own, const plane *flat, const float3 begin, const float3 end)
+/* True where a vertex of an entry has moved since. */
+static inline int has_moved(__global const float *vertices, const triangle t)
 {
+    const int3 moved = (vload3(t.names.x, vertices) != t.a) | (vload3(t.names.y, vertices) != t.b)
+        | (vload3(t.names.z, vertices) != t.c);
+    return moved.x || moved.y || moved.z;
+}
+
+/* Steps of a coordinate along an axis; grid: origin, steps per unit, and the last step of x, y and z. */
+static inline int step_of(__global const float *grid, const int axis, const float coordinate)
+{
+    return (int)clamp((coordinate - grid[axis]) * grid[3 + axis], 0.0f, grid[6 + axis]);
+}
+
+/* Entries from place on that may cut the triangle: the pair counts in this row, its box overlaps theirs, and neither lies
+ * on one side of the other's plane. */
+static inline ints not_apart(
+    __global const float *places, __global const int *names, const uint stride, const uint place, const int last_key,
+    const int first_rows, const triangle *own, const plane *flat, const float3 begin, const float3 end)
+{
+    ints left = (load_lanes(names + KEY * (size_t)stride + place) <= last_key)
+        & ((load_lanes(names + FIRST_ROWS * (size_t)stride + place) | first_rows) == BOTH);
     const points d = points_at(places, stride, place), e = points_at(places + 3 * (size_t)stride, stride, place);
     const points f = points_at(places + 6 * (size_t)stride, stride, place);
-    ints left = counts & (greater(greater(d.x, e.x), f.x) >= begin.x) & (lesser(lesser(d.x, e.x), f.x) <= end.x);
+    left &= (greater(greater(d.x, e.x), f.x) >= begin.x) & (lesser(lesser(d.x, e.x), f.x) <= end.x);
     left &= (greater(greater(d.y, e.y), f.y) >= begin.y) & (lesser(lesser(d.y, e.y), f.y) <= end.y);
     left &= (greater(greater(d.z, e.z), f.z) >= begin.z) & (lesser(lesser(d.z, e.z), f.z) <= end.z);
     if (!ANY_LANE(left))
         return left;
     ints common = (ints)(0);
     for (int n = 0; n < 3; ++n) {
-        const ints name = load_lanes((__global const int *)names + (size_t)n * stride + place);
+        const ints name = load_lanes(names + (size_t)n * stride + place);
         common += choose(
             (name == (int)own->names.x) | (name == (int)own->names.y) | (name == (int)own->names.z), (ints)(1), (ints)(0));
     }
@@ -236,24 +267,25 @@ static inline ints not_apart(
 
 /* Parameters  vertices   in   (vertices, 3) coordinates, of which the largest had a magnitude of 1024 to 2048
  *             triangles  in   (count, 3) their corners
- *             order      in   (count,) triangle of each entry
- *             places     out  (10, stride) coordinates of the corners of each entry, x y z of the first, of the second, of
- *                             the third; the lowest x
- *             names      out  (3, stride) corners of each entry
- *             marks  in and out  (stride + 31 / 32,) bits of entries
+ *             order rows in   (count,) triangle and row of each entry
+ *             grid       in   (3, 3) see step_of
+ *             places     out  (PLACES, stride) coordinates of the corners of each entry
+ *             names      out  (NAMES, stride) corners of each entry, FIRST_ROWS, KEY
+ *             reaches in and out  (rows,) longest side along x of the boxes of a row, as bits
+ *             marks   in and out  ((stride + 31) / 32,) bits of entries
  *             first items   the entries that are written
  * Launch      global = items rounded up by the host, any local
  * Guarantees  entries from first + count on lie at infinity; a bit is set for each triangle without area.
- *             Races: marks by atomic_or() alone */
+ *             Races: marks by atomic_or(), reaches by atomic_max() alone */
 __kernel void enter_triangles(
     __global const float *restrict vertices, __global const uint *restrict triangles, __global const uint *restrict order,
-    __global float *restrict places, __global uint *restrict names, __global uint *restrict marks, const uint first,
+    __global const uint *restrict rows, __global const float *restrict grid, __global float *restrict places,
+    __global uint *restrict names, __global uint *restrict reaches, __global uint *restrict marks, const uint first,
     const uint items, const uint count, const uint stride)
 {
     const uint item = get_global_id(0), entry = first + item;
     if (item >= items)
         return;
-    float low = INFINITY;
     for (uint corner = 0; corner < 3; ++corner) {
         const uint name = item < count ? triangles[3 * (size_t)order[item] + corner] : 0;
         const float3 at = item < count ? vload3(name, vertices) : (float3)(INFINITY);
@@ -262,89 +294,86 @@ __kernel void enter_triangles(
         row[0] = at.x;
         row[stride] = at.y;
         row[2 * (size_t)stride] = at.z;
-        low = fmin(low, at.x);
     }
-    places[9 * (size_t)stride + entry] = low;
+    names[KEY * (size_t)stride + entry] = NOWHERE;
+    names[FIRST_ROWS * (size_t)stride + entry] = 0;
     if (item >= count)
         return;
     const triangle own = triangle_at(places, names, stride, entry);
+    const float3 low = fmin(fmin(own.a, own.b), own.c), high = fmax(fmax(own.a, own.b), own.c);
+    const int row = (int)rows[item], ny = (int)grid[7] + 1;
+    names[KEY * (size_t)stride + entry] = (uint)(row * ((int)grid[6] + 1) + step_of(grid, 0, low.x));
+    names[FIRST_ROWS * (size_t)stride + entry]
+        = (uint)(step_of(grid, 1, low.y) == row % ny) | (uint)(step_of(grid, 2, low.z) == row / ny) << 1;
+    const uint reach = as_uint(high.x - low.x);
+    if (reach > reaches[row])
+        atomic_max(&reaches[row], reach);
     const plane flat = plane_of(own.a, own.b, own.c);
-    const int3 has_area = fabs(flat.normal) > ROUNDING * flat.terms;
-    if (!(has_area.x || has_area.y || has_area.z))
+    if (!has_area(&flat))
         atomic_or(&marks[entry / 32u], 1u << entry % 32u);
 }
 
-/* Parameters  places names  in   (10, stride), (3, stride) see enter_triangles
- *             starts    in   (rows + 1,) first entry of each row; those of a level side by side, z * ny + y
- *             levels    in   (levels, 4) first row, rows along y, rows along z, and the end of the entries of each level
- *             edges     in   (levels, 4) width of the rows, longest side of the boxes, y and z that rows are counted from
- *             marks     in and out  (stride + 31 / 32,) bits of entries
- *             first items   the entries of this launch;  level_count: levels;  older: levels of entries that were entered
- *                            before these;  stride: at least n + LANES
+/* Parameters  places names grid reaches  in   see enter_triangles
+ *             starts    in   (older, rows + 1) first entry of each row of the older generations
+ *             vertices  in   (vertices, 3) see enter_triangles, as they are now
+ *             marks     in and out  (2, (stride + 31) / 32) bits of entries that may cut another one, and that surely do
+ *             first items   the entries of this launch;  older: generations that were entered before these;  stride: at
+ *                            least n + LANES
  * Launch      global = items rounded up by the host, any local
- * Assumes     entries in the order of level, row and low x; at most 4096 rows along an axis
+ * Assumes     entries of a generation in the order of their keys
  * Guarantees  a bit is set for both triangles of each pair that touch each other beside common corners and have one of
- *             these entries; bits are only added.
+ *             these entries; where the second row has it, they cut each other; bits are only added.
  *             Races: marks by atomic_or() alone */
 __kernel void mark_crossings(
-    __global const float *restrict places, __global const uint *restrict names, __global const uint *restrict starts,
-    __global const uint *restrict levels, __global const float *restrict edges, __global uint *restrict marks,
-    const uint first, const uint items, const uint level_count, const uint older, const uint stride)
+    __global const float *restrict places, __global const uint *restrict names, __global const float *restrict grid,
+    __global const float *restrict vertices, __global const uint *restrict starts, __global const uint *restrict reaches, __global uint *restrict marks,
+    const uint first, const uint items, const uint older, const uint stride)
 {
     if (get_global_id(0) >= items)
         return;
     const uint entry = first + get_global_id(0);
-    __global const float *low_x = places + 9 * (size_t)stride;
+    __global const int *keys = (__global const int *)names + KEY * (size_t)stride;
     const triangle own = triangle_at(places, names, stride, entry);
     const float3 begin = fmin(fmin(own.a, own.b), own.c), end = fmax(fmax(own.a, own.b), own.c);
     const plane flat = plane_of(own.a, own.b, own.c);
-    uint own_level = older;
-    while (entry >= levels[4 * own_level + 3])
-        ++own_level;
-    for (uint level = 0; level < level_count; ++level) {
-        if (level >= older && (level + 1 < own_level || level == own_level + 1))
-            continue; /* their triangles look here */
-        const uint first_row = levels[4 * level];
-        const int ny = (int)levels[4 * level + 1], nz = (int)levels[4 * level + 2];
-        const float per_edge = 1.0f / edges[4 * level], reach = (1.0f + SLACK) * edges[4 * level + 1];
-        const float origin_y = edges[4 * level + 2], origin_z = edges[4 * level + 3];
-        const float from_y = (begin.y - reach - origin_y) * per_edge;
-        const float from_z = (begin.z - (level == own_level ? 0.0f : reach) - origin_z) * per_edge;
-        const int y0 = max((int)floor(from_y - SLACK), 0);
-        const int y1 = min((int)floor((end.y - origin_y) * per_edge + SLACK), ny - 1);
-        const int z0 = max((int)floor(from_z - SLACK), 0);
-        const int z1 = min((int)floor((end.z - origin_z) * per_edge + SLACK), nz - 1);
-        const float least_x = begin.x - reach;
-        for (int z = z0; z <= z1; ++z)
-            for (int y = y0; y <= y1; ++y) {
-                const uint row = first_row + (uint)z * (uint)ny + (uint)y;
-                uint place = starts[row];
-                const uint row_end = starts[row + 1];
-                if (level == own_level)
-                    place = max(place, entry + 1u);
-                uint beyond = row_end;
-                while (place < beyond) { /* the first entry that begins at least_x or later */
-                    const uint middle = place + (beyond - place) / 2u;
-                    if (low_x[middle] < least_x)
-                        place = middle + 1u;
-                    else
-                        beyond = middle;
-                }
-                for (; place < row_end && low_x[place] <= end.x; place += LANES) {
-                    const ints counts = LANE_NUMBERS < (float)(row_end - place);
-                    const ints left = not_apart(places, names, stride, place, counts, &own, &flat, begin, end);
-                    if (!ANY_LANE(left))
-                        continue;
-                    int lanes[LANES];
-                    store_lanes(left, lanes);
-                    for (uint lane = 0; lane < LANES; ++lane) {
-                        const uint other = place + lane;
-                        if (lanes[lane] && may_cut(own, triangle_at(places, names, stride, other))) {
-                            atomic_or(&marks[entry / 32u], 1u << entry % 32u);
-                            atomic_or(&marks[other / 32u], 1u << other % 32u);
-                        }
-                    }
-                }
+    const int first_rows = (int)names[FIRST_ROWS * (size_t)stride + entry], bins = (int)grid[6] + 1;
+    const int row = keys[entry] / bins, row_key = row * bins, last_key = row_key + step_of(grid, 0, end.x);
+    const uint rows = ((uint)grid[7] + 1) * ((uint)grid[8] + 1);
+    for (uint generation = 0; generation <= older; ++generation) {
+        uint place = entry + 1, row_end = stride;
+        if (generation < older) {
+            __global const uint *of_row = starts + generation * (size_t)(rows + 1) + row;
+            place = of_row[0];
+            row_end = of_row[1];
+            uint beyond = row_end;
+            const int first_key = row_key + step_of(grid, 0, begin.x - as_float(reaches[row])) - 1; /* for rounding */
+            while (place < beyond) { /* the first entry that may reach the box */
+                const uint middle = place + (beyond - place) / 2u;
+                if (keys[middle] < first_key)
+                    place = middle + 1u;
+                else
+                    beyond = middle;
             }
+        }
+        for (; place < row_end && keys[place] <= last_key; place += LANES) {
+            const ints left = not_apart(
+                places, (__global const int *)names, stride, place, last_key, first_rows, &own, &flat, begin, end);
+            if (!ANY_LANE(left))
+                continue;
+            int lanes[LANES];
+            store_lanes(left, lanes);
+            for (uint lane = 0; lane < LANES; ++lane) {
+                const uint other = place + lane;
+                if (!lanes[lane])
+                    continue;
+                const triangle its = triangle_at(places, names, stride, other);
+                const int found = compare_triangles(own, its);
+                if (found == APART || (generation < older && has_moved(vertices, its)))
+                    continue;
+                __global uint *row_of_marks = found == CUT ? marks + (stride + 31) / 32u : marks;
+                atomic_or(&row_of_marks[entry / 32u], 1u << entry % 32u);
+                atomic_or(&row_of_marks[other / 32u], 1u << other % 32u);
+            }
+        }
     }
 }

@@ -81,7 +81,8 @@ def find_used(numbers: IntArray, size: int) -> IntArray:
 
 def list_runs(first: IntArray, size: IntArray) -> IntArray:
     """Return the whole numbers of runs one after the other, each of `size` from `first` on."""
-    return np.repeat(first - (np.cumsum(size) - size), size) + np.arange(int(size.sum()))
+    ends = np.cumsum(size, dtype=first.dtype)
+    return np.repeat(first - (ends - size), size) + np.arange(int(size.sum()), dtype=first.dtype)
 
 
 def number_used(triangles: NDArray[np.uint32], vertex_count: int) -> tuple[IntArray, NDArray[np.uint32]]:

@@ -56,8 +56,15 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
     "enter_triangles": {
         "places": (("row[0] = at.x;", "row[0] = -at.x;"),),
         "names": (("stride + entry] = name;", "stride + entry] = name + corner;"),),
+        "keys": (("+ step_of(grid, 0, low.x));", "- step_of(grid, 0, low.x));"),),
+        "first rows": (("== row % ny)", "!= row % ny)"),),
+        "reaches": (("atomic_max(", "atomic_min("),),
     },
-    "mark_crossings": {"marks": (("&& may_cut(own,", "&& !may_cut(own,"),)},
+    "mark_crossings": {
+        "marks": (("if (found == APART ||", "if (found != APART ||"),),
+        "certainty": (("found == CUT ? marks + ", "found != CUT ? marks + "),),
+        "changes": (("&& has_moved(", "&& !has_moved("),),
+    },
     "clear_labels": {"labels": (("= UNUSED;", "= ~UNUSED;"),)},
     "hook_corners": {"labels": (("min(corner.x, min(corner.y, corner.z))", "max(corner.x, max(corner.y, corner.z))"),)},
     "jump_labels": {"labels": ((": follow_labels(", ": n - 1 - follow_labels("),)},

@@ -20,7 +20,7 @@ from clrecon.mesh.refine.shifts import Follow, follow_none
 from clrecon.mesh.refine.topology import TopologyChange, any_corner, compare_topology, measure_topology
 from clrecon.mesh.triangle_tree import Curve
 from clrecon.mesh.triangles import cross_products, vertex_normals
-from clrecon.system.pieces import local_origin
+from clrecon.system.pieces import list_distinct, local_origin
 from clrecon.system.progress import Progress
 
 BOUND_VOXEL = 0.25
@@ -179,11 +179,12 @@ class _Decimation:
         self._witnesses = np.full((4, count), SEVERAL, np.int32)
         new = self._take_over(np.arange(len(self._names)), np.arange(count))
         marks = self._follow(self._stored, self._faces, new)
-        suspects = new if marks is None else marks.look()
+        suspects = new if marks is None else list_distinct(np.concatenate(marks.look()))
         while len(collapses := self._latest_of([*self._find_far(new), *self._find_unsound(suspects, new)])):
             vertices = history.name_again(self._names, history.undo(collapses))
             new = self._take_over(vertices, self._given.fans.touching(vertices))
-            suspects = np.flatnonzero(self._is_face) if marks is None else marks.look_again(self._stored, new)
+            again = (np.flatnonzero(self._is_face),) if marks is None else marks.look_again(self._stored, new)
+            suspects = list_distinct(np.concatenate(again))
         return before - history.count
 
     def _take_over(self, vertices: IntArray, rows: IntArray) -> IntArray:

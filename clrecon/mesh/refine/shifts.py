@@ -41,10 +41,13 @@ def enclosed_mm3(
 
 
 class Marks(Protocol):
-    """Triangles of a surface, and of it changed, among which are all that touch another one, or have no area."""
+    """Triangles of a surface, and of it changed, that may touch another one or have no area, and those that cut one.
 
-    def look(self) -> IntArray: ...
-    def look_again(self, vertices: NDArray[np.float32], changed: IntArray, /) -> IntArray: ...
+    All that touch another one, or have no area, are among them.
+    """
+
+    def look(self) -> tuple[IntArray, IntArray]: ...
+    def look_again(self, vertices: NDArray[np.float32], changed: IntArray, /) -> tuple[IntArray, IntArray]: ...
 
 
 Follow = Callable[..., Marks | None]
@@ -80,7 +83,7 @@ def move_vertices(
     spoilt: IntArray = (
         _find_spoilt(moved, triangles, changed)
         if marks is None
-        else _find_spoilt_among(marks.look(), moved, triangles, changed)
+        else _find_spoilt_among(*marks.look(), moved, triangles, changed)
     )
     near: _Near | None = None
     for turn in range(_ROUNDS):
@@ -105,7 +108,7 @@ def move_vertices(
             near = near or _Near(vertices, moved, triangles)
             spoilt = near.find_spoilt(changed)
         else:
-            spoilt = _find_spoilt_among(marks.look_again(moved, rows), moved, triangles, changed)
+            spoilt = _find_spoilt_among(*marks.look_again(moved, rows), moved, triangles, changed)
     return moved, int(np.count_nonzero(share < 1.0))
 
 
@@ -132,17 +135,20 @@ class _Near:
         pieces = find_boxes_beside(self._low, self._high, *boxes)
         rows = np.sort(self._order[np.repeat(pieces, _IN_A_BLOCK)[: len(changed)]])
         rows = rows[find_beside(moved, self._triangles[rows], changed[rows])]
-        return _find_spoilt_among(rows, moved, self._triangles, changed)
+        return _find_spoilt_among(rows, rows[:0], moved, self._triangles, changed)
 
 
 def _find_spoilt_among(
-    rows: IntArray, vertices: NDArray[np.floating], triangles: NDArray[np.uint32], changed: NDArray[np.bool_]
+    rows: IntArray,
+    cut: IntArray,
+    vertices: NDArray[np.floating],
+    triangles: NDArray[np.uint32],
+    changed: NDArray[np.bool_],
 ) -> IntArray:
-    """Do what `_find_spoilt` does among some rows of the triangles."""
-    if len(rows) == 0:
-        return rows
+    """Do what `_find_spoilt` does among some rows of the triangles, beside which others surely cut each other."""
     used, corners = number_used(triangles[rows], len(vertices))
-    return used[_find_spoilt(vertices[used], corners, changed[rows])]
+    spoilt = used[_find_spoilt(vertices[used], corners, changed[rows])] if len(rows) else rows
+    return find_used(np.concatenate([spoilt, triangles[cut].reshape(-1)]), len(vertices))
 
 
 def _find_spoilt(vertices: NDArray[np.floating], triangles: NDArray[np.uint32], look_at: NDArray[np.bool_]) -> IntArray:

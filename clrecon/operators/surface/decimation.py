@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from clrecon import opencl as ocl
 from clrecon.mesh import Mesh
-from clrecon.mesh.connectivity import find_used, number_used
+from clrecon.mesh.connectivity import find_used, list_runs, number_used, order_by_number
 from clrecon.mesh.intersections import find_boxes, find_self_intersections
 from clrecon.mesh.refine import decimation
 from clrecon.opencl import Device
@@ -18,19 +18,24 @@ from clrecon.operators.masks.voxel_mask import zero_words
 from clrecon.operators.surface.collapse import DeviceCollapser
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.light_dataclass import dataclass
+from clrecon.system.pieces import find_bounds
 from clrecon.system.progress import Progress, Steps
 
 _FEWEST = 20_000
 """Meshes with fewer triangles are looked at by the host alone, in less time than the device needs to begin."""
 
-_MOST_ROWS = 1 << 22
-"""Rows of the finest level; its edge is made longer until there are no more."""
+_MOST_ROWS = 1 << 18
+"""Their edge is made longer until there are no more."""
 
-_FINEST = 0.97
-"""Share of the triangles in the finest level; a half takes 1.2 to 1.5 times as long, as each level is searched."""
+_MORE_ENTRIES = 0.5
+"""Entries for each triangle beside its first; wider rows have less of them, but longer ways to go in each."""
 
-_ROW_BOXES = 2.0
-"""Width of the rows in boxes as long as `_FINEST` has them; one or three take a tenth longer."""
+_BINS = 1 << 13
+"""Steps of x by which the entries of a row are sorted: with `_MOST_ROWS` rows their number fits 31 bits."""
+
+_PLACES, _NAMES = 9, 5
+_ENTRY_BYTES = 4 * (_PLACES + _NAMES)
+"""Rows of the tables of entries, as the kernels have them."""
 
 _MOST_LANES = 8
 """Entries that the kernel looks at together."""
@@ -43,30 +48,49 @@ IntArray = NDArray[np.integer]
 
 
 @dataclass(frozen=True)
+class RowGrid:
+    """Rows along x, and the steps of x by which their entries are sorted: floor((coordinate - origin) * per_step).
+
+    origin, per_step, last: ndarray, shape (3,), float32. Of the last step along each axis, beyond which none is.
+    """
+
+    origin: Float32Array
+    per_step: Float32Array
+    last: Float32Array
+
+    @property
+    def rows(self) -> int:
+        return int((self.last[1] + 1.0) * (self.last[2] + 1.0))
+
+    def steps(self, coordinates: Float32Array, axis: int) -> NDArray[np.int32]:
+        """Return the steps of coordinates along an axis, as the kernel counts them."""
+        steps = (coordinates - self.origin[axis]) * self.per_step[axis]
+        return np.clip(steps, np.float32(0.0), self.last[axis]).astype(np.int32)
+
+
+@dataclass(frozen=True)
 class CrossingPlan:
-    """Triangles in the rows of levels, as the kernel reads them.
+    """Triangles in all rows that their boxes touch, as the kernel reads them.
 
     vertices: ndarray, shape (v, 3), float32. Scaled by two to the power of `exponent`, which changes no digit.
-    triangles, order: ndarray, shapes (n, 3) and (n,), uint32. Of the order: the triangle of each entry.
-    starts: ndarray, uint32. First entry of each row, and the number of entries.
-    levels, edges: ndarray, shape (levels, 4) uint32, (levels, 4) float32
+    triangles: ndarray, shape (n, 3), uint32
+    order, rows: ndarray, shape (e,), uint32. Triangle and row of each entry, those of a row by their lowest x.
     """
 
     vertices: Float32Array
     exponent: int
     triangles: NDArray[np.uint32]
+    grid: RowGrid
     order: NDArray[np.uint32]
-    starts: NDArray[np.uint32]
-    levels: NDArray[np.uint32]
-    edges: Float32Array
+    rows: NDArray[np.uint32]
 
     @property
     def stride(self) -> int:
         return len(self.order) + _MOST_LANES
 
     def needs(self) -> dict[str, int]:
-        given = self.vertices.nbytes + self.triangles.nbytes + self.order.nbytes
-        return {"triangles in rows": given + 52 * self.stride + self.starts.nbytes, "marks": len(self.order) // 8}
+        given = self.vertices.nbytes + self.triangles.nbytes + 2 * self.order.nbytes
+        return {"triangles in rows": given + _ENTRY_BYTES * self.stride, "marks": self.stride // 8}
 
 
 def plan_crossings(
@@ -74,46 +98,41 @@ def plan_crossings(
 ) -> CrossingPlan:
     """Enter at least one triangle into rows; those of `rows` alone where they are given."""
     exponent = 11 - int(np.frexp(np.abs(vertices).max())[1])
-    entered = triangles if rows is None else triangles[rows]
-    plan = _enter_into_rows(np.ldexp(vertices, exponent), exponent, entered, most_rows)
+    scaled, entered = np.ldexp(vertices, exponent), triangles if rows is None else triangles[rows]
+    low, high = find_boxes(scaled, entered)
+    across, deep = (high[:, axis] - low[:, axis] for axis in (1, 2))
+    # Of rows so wide a box of these sides touches (1 + across / edge) * (1 + deep / edge), on average.
+    both, square = (float(np.mean(terms, dtype=np.float64)) / _MORE_ENTRIES for terms in (across + deep, across * deep))
+    edge = max(1.0, 0.5 * (both + np.sqrt(both * both + 4.0 * square)))
+    origin, end = find_bounds(low)
+    while True:
+        per_step = np.array([_BINS / max(end[0] - origin[0], 8.0), 1.0 / edge, 1.0 / edge], np.float32)
+        grid = RowGrid(origin, per_step, np.append(np.float32(_BINS - 1), np.floor((end - origin)[1:] * per_step[1:])))
+        if grid.rows <= most_rows:
+            break
+        edge *= 1.25
+    plan = _enter_into_rows(scaled, exponent, entered, grid, low, high)
     return plan if rows is None else replace(plan, triangles=triangles, order=rows.astype(np.uint32)[plan.order])
 
 
 def _enter_into_rows(
-    scaled: Float32Array, exponent: int, triangles: NDArray[np.uint32], most_rows: int = _MOST_ROWS
+    scaled: Float32Array, exponent: int, triangles: NDArray[np.uint32], grid: RowGrid, *boxes: Float32Array
 ) -> CrossingPlan:
-    low, high = (np.ascontiguousarray(corner.T) for corner in find_boxes(scaled, triangles))
-    high -= low
-    longest = np.maximum(np.maximum(high[0], high[1]), high[2])
-    origin, beyond = low.min(axis=1).astype(np.float64), low.max(axis=1).astype(np.float64)
-    some = longest[:: max(1, len(longest) // 10_000)].astype(np.float64)
-    edge = max(1.0, _ROW_BOXES * float(np.quantile(some, _FINEST)))
-    while np.prod(np.floor((beyond - origin)[1:] / edge) + 1.0) > most_rows:
-        edge *= 1.25
-    level = np.zeros(len(longest), np.int8)
-    coarse = np.flatnonzero(longest > edge)
-    level[coarse] = np.ceil(np.log2(longest[coarse].astype(np.float64) / edge))
-    edges = (edge * 2.0 ** np.arange(int(level.max()) + 1)).astype(np.float32)
-    size = (np.floor((beyond - origin)[1:] / edges[:, None].astype(np.float64)) + 1.0).astype(np.int64)  # y, z
-    first_row = np.concatenate([[0], np.cumsum(size.prod(axis=1))])
-    row, longest_of = np.empty(len(longest), np.int64), np.zeros(len(edges))
-    for number, width in enumerate(edges.astype(np.float64)):
-        rows = np.flatnonzero(level == number) if number else slice(None)  # coarse ones are entered anew
-        y, z = (((low[axis, rows] - origin[axis]) / width).astype(np.int64) for axis in (1, 2))
-        row[rows] = first_row[number] + y + size[number, 0] * z
-        longest_of[number] = longest[level == number].max(initial=0.0)
-    bits = low[0].view(np.int32)
-    order = np.argsort(row << 32 | np.where(bits < 0, ~bits, bits ^ np.int32(-(2**31))).view(np.uint32))
-    starts = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=first_row[-1]))]).astype(np.uint32)
-    levels = np.column_stack([first_row[:-1], size, starts[first_row[1:]]]).astype(np.uint32)
-    table = np.column_stack([edges, longest_of, *(np.full(len(edges), at) for at in origin[1:])]).astype(np.float32)
-    return CrossingPlan(scaled, exponent, triangles, order.astype(np.uint32), starts, levels, table)
+    by_x = np.argsort(grid.steps(boxes[0][:, 0], 0).astype(np.uint16), kind="stable")
+    corners = [corner.take(by_x, axis=0) for corner in boxes]
+    (first_y, first_z), (last_y, last_z) = ([grid.steps(corner[:, n], n) for n in (1, 2)] for corner in corners)
+    wide, deep = last_y - first_y + 1, last_z - first_z + 1
+    z, wide_of_z = list_runs(first_z, deep), wide.repeat(deep)
+    rows = list_runs(first_y.repeat(deep), wide_of_z) + (int(grid.last[1]) + 1) * z.repeat(wide_of_z)
+    order = order_by_number(rows, grid.rows)
+    entries = by_x.astype(np.uint32).repeat(wide * deep).take(order)
+    return CrossingPlan(scaled, exponent, triangles, grid, entries, rows.take(order).astype(np.uint32))
 
 
 class CrossingMarks:
     """Triangles of a surface that may cut another one, marked on a device: of a plan, and of what has changed since.
 
-    spare: Most triangles that are entered after those of the plan.
+    spare: Most entries that are made after those of the plan.
     """
 
     def __init__(self, device: Device, plan: CrossingPlan, *, spare: int = 0):
@@ -123,58 +142,64 @@ class CrossingMarks:
         self._forget(plan)
 
     def _forget(self, plan: CrossingPlan) -> None:
-        self._stride = plan.stride + self._spare
-        self._places_d, self._names_d = (ocl.allocate(self._device, 4 * rows * self._stride) for rows in (10, 3))
+        stride = self._stride = plan.stride + self._spare
+        self._places_d, self._names_d = (ocl.allocate(self._device, 4 * n * stride) for n in (_PLACES, _NAMES))
         self._plan = plan
-        self._rows = self._starts = np.zeros(0, np.uint32)
-        self._levels, self._edges = np.zeros((0, 4), np.uint32), np.zeros((0, 4), np.float32)
+        self._triangles, self._starts = np.zeros(0, np.uint32), np.zeros(0, np.uint32)
+        grid = plan.grid
+        self._grid_d = ocl.upload(self._device, np.concatenate([grid.origin, grid.per_step, grid.last]))
+        self._reaches_d = zero_words(self._device, grid.rows)
 
-    def look(self, *, piece: int = _PIECE, steps: Steps | None = None) -> IntArray:
-        """Return the triangles of the plan without area, and those that may cut another one."""
+    def look(self, *, piece: int = _PIECE, steps: Steps | None = None) -> tuple[IntArray, IntArray]:
+        """Return the triangles of the plan that may cut another one, or have no area, and those that surely cut one."""
         return self._mark(self._plan, self._plan.order, piece=piece, steps=steps)
 
-    def look_again(self, vertices: Float32Array, changed: IntArray) -> IntArray:
+    def look_again(self, vertices: Float32Array, changed: IntArray) -> tuple[IntArray, IntArray]:
         """Return the same of triangles that have changed, and what they may cut; of all where there is no room left."""
         plan, triangles = self._plan, self._plan.triangles[changed]
-        if len(self._rows) + len(changed) + _MOST_LANES > self._stride:
-            rows = find_used(np.concatenate([self._rows, changed]), len(plan.triangles))
-            self._forget(plan_crossings(vertices, plan.triangles, rows))
-            return self.look()
         used = find_used(triangles, len(vertices))
         plan.vertices[used] = np.ldexp(vertices[used], plan.exponent)
-        again = _enter_into_rows(plan.vertices, plan.exponent, triangles)
+        boxes = find_boxes(plan.vertices, triangles)
+        again = _enter_into_rows(plan.vertices, plan.exponent, triangles, plan.grid, *boxes)
+        if len(self._triangles) + again.stride > self._stride:
+            rows = find_used(np.concatenate([self._triangles, changed]), len(plan.triangles))
+            self._forget(plan_crossings(vertices, plan.triangles, rows))
+            return self.look()
         return self._mark(again, changed.astype(np.uint32)[again.order])
 
     def _mark(
-        self, plan: CrossingPlan, rows: NDArray[np.uint32], *, piece: int = _PIECE, steps: Steps | None = None
-    ) -> IntArray:
-        device = self._device
-        first, older = len(self._rows), len(self._edges)
-        levels = plan.levels + np.array([len(self._starts), 0, 0, first], np.uint32)
-        self._starts = np.concatenate([self._starts, plan.starts + np.uint32(first)])
-        self._levels, self._edges = np.vstack([self._levels, levels]), np.vstack([self._edges, plan.edges])
-        self._rows = np.concatenate([self._rows, rows])
-        tables = {"starts": self._starts, "levels": self._levels, "edges": self._edges}
-        tables_d = {name: ocl.upload(device, table) for name, table in tables.items()}
-        marks_d = zero_words(device, (self._stride + 31) // 32)
-        shared = {"places": self._places_d, "names": self._names_d, "marks": marks_d, "stride": self._stride}
+        self, plan: CrossingPlan, triangles: NDArray[np.uint32], *, piece: int = _PIECE, steps: Steps | None = None
+    ) -> tuple[IntArray, IntArray]:
+        device, rows = self._device, plan.grid.rows
+        first, older = len(self._triangles), len(self._starts) // (rows + 1)
+        ends = first + np.cumsum(np.bincount(plan.rows, minlength=rows))
+        starts_d = ocl.upload(device, np.append(self._starts, np.uint32(first)))
+        self._starts = np.concatenate([self._starts, [first], ends]).astype(np.uint32)
+        self._triangles = np.concatenate([self._triangles, triangles])
+        marks = np.empty((2, (self._stride + 31) // 32), np.uint32)
+        marks_d = zero_words(device, marks.size)
+        shared = {
+            "vertices": ocl.upload(device, plan.vertices), "places": self._places_d, "names": self._names_d,
+            "marks": marks_d, "grid": self._grid_d, "reaches": self._reaches_d, "stride": self._stride,
+        }  # fmt: skip
         ocl.launch(
-            device, self._program["enter_triangles"], plan.stride, vertices=ocl.upload(device, plan.vertices),
-            triangles=ocl.upload(device, plan.triangles), order=ocl.upload(device, plan.order), **shared,
-            first=first, items=plan.stride, count=len(rows),
+            device, self._program["enter_triangles"], plan.stride, triangles=ocl.upload(device, plan.triangles),
+            order=ocl.upload(device, plan.order), rows=ocl.upload(device, plan.rows), **shared, first=first,
+            items=plan.stride, count=len(triangles),
         )  # fmt: skip
-        for begin in range(first, len(self._rows), piece):
-            items = min(piece, len(self._rows) - begin)
+        for begin in range(first, len(self._triangles), piece):
+            items = min(piece, len(self._triangles) - begin)
             ocl.launch(
-                device, self._program["mark_crossings"], items, **shared, **tables_d, first=begin, items=items,
-                level_count=len(self._edges), older=older,
+                device, self._program["mark_crossings"], items, **shared, starts=starts_d, first=begin, items=items,
+                older=older,
             )  # fmt: skip
             if steps is not None:
                 ocl.wait(device)
-                steps.take(items)
-        words = ocl.download(device, np.empty((self._stride + 31) // 32, np.uint32), marks_d)
-        entries = np.flatnonzero(np.unpackbits(words.view(np.uint8), bitorder="little"))
-        return find_used(self._rows[entries], len(self._plan.triangles))
+                done = (begin + np.array([0, items])) * len(plan.triangles) // len(triangles)
+                steps.take(int(done[1] - done[0]))
+        bits = np.unpackbits(ocl.download(device, marks, marks_d).view(np.uint8), axis=1, bitorder="little")
+        unsure, cut = (find_used(self._triangles[np.flatnonzero(row)], len(self._plan.triangles)) for row in bits)
+        return unsure, cut
 
 
 def follow_crossings(
@@ -187,8 +212,9 @@ def follow_crossings(
     count = len(triangles if rows is None else rows)
     if count < fewest or vertices.dtype != np.float32:
         return None
-    plan, spare = plan_crossings(vertices, triangles, rows), count // 8
-    needs = {**plan.needs(), "changed triangles": 52 * spare}
+    plan = plan_crossings(vertices, triangles, rows)
+    spare = plan.stride // 8
+    needs = {**plan.needs(), "changed triangles": _ENTRY_BYTES * spare}
     has_room = not ocl.describe_shortage(ocl.memory_limits(device, memory), needs)
     return CrossingMarks(device, plan, spare=spare) if has_room else None
 
@@ -205,15 +231,16 @@ def find_crossings(
     """Find the pairs of triangles that cut each other, (k, 2) int64, see
     `clrecon.mesh.intersections.find_self_intersections`.
 
-    Fewer triangles than `fewest`, float64 vertices and meshes
-    without room on the device are left to the host, which finds the same pairs.  `steps` counts the triangles.
+    Fewer triangles than `fewest`, float64 vertices and meshes without room on the device are left to the host, which
+    finds the same pairs.  `steps` counts the triangles.
     """
     if len(triangles) < fewest or vertices.dtype != np.float32:
         return find_self_intersections(vertices, triangles, steps=steps)
     plan = plan_crossings(vertices, triangles)
     if ocl.describe_shortage(ocl.memory_limits(device, memory), plan.needs()):
         return find_self_intersections(vertices, triangles, steps=steps)
-    marked = CrossingMarks(device, plan).look(steps=steps).astype(np.int64)
+    looked_at = np.concatenate(CrossingMarks(device, plan).look(steps=steps))
+    marked = find_used(looked_at, len(triangles)).astype(np.int64)
     used, corners = number_used(triangles[marked], len(vertices))
     return marked[find_self_intersections(vertices[used], corners)]
 

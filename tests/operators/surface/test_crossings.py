@@ -28,7 +28,12 @@ def scattered(count: int, sizes=(0.3, 1.0, 6.0), seed: int = 5, extent=(30.0, 30
 
 
 def marked(device, vertices, triangles, **options):
-    return CrossingMarks(device, plan_crossings(vertices, triangles)).look(**options)
+    return together(CrossingMarks(device, plan_crossings(vertices, triangles)).look(**options))
+
+
+def together(found):
+    unsure, cut = found
+    return np.union1d(unsure, cut)
 
 
 def pairs(found) -> set[tuple[int, int]]:
@@ -46,18 +51,60 @@ def test_crossing_triangles_are_marked_as_by_the_twin(device, count):
 MANY_SMALL_TRIANGLES = (*[0.1] * 60, 6.0)  # mm
 
 
-def test_edges_of_levels_double_and_hold_the_longest_side_of_their_triangles():
+def test_triangles_are_entered_in_the_rows_that_their_boxes_touch():
     plan = plan_crossings(*scattered(700, sizes=MANY_SMALL_TRIANGLES), most_rows=100)
-    edges, longest = plan.edges.T[:2]
-    assert len(edges) == len(plan.levels) > 1
-    np.testing.assert_allclose(edges, edges[0] * 2.0 ** np.arange(len(edges)), rtol=1e-6)  # float32
-    assert (longest <= edges).all()
+    corners, ny = plan.vertices[plan.triangles], int(plan.grid.last[1]) + 1
+    low, high = (plan.grid.steps(box[:, 1], 1) for box in (corners.min(axis=1), corners.max(axis=1)))
+    deep, far = (plan.grid.steps(box[:, 2], 2) for box in (corners.min(axis=1), corners.max(axis=1)))
+    expected = {
+        (row, y + ny * z)
+        for row in range(700)
+        for z in range(deep[row], far[row] + 1)
+        for y in range(low[row], high[row] + 1)
+    }
+    assert len(expected) > 800  # measured 898
+    assert set(zip(plan.order.tolist(), plan.rows.tolist(), strict=True)) == expected
+    assert len(plan.order) == len(expected)
 
 
-def test_finest_level_has_no_more_rows_than_allowed_and_more_than_half_of_them():
+def test_entries_of_a_row_lie_in_the_order_of_their_lowest_x():
     plan = plan_crossings(*scattered(700, sizes=MANY_SMALL_TRIANGLES), most_rows=100)
-    rows = plan.levels[:, 1].astype(int) * plan.levels[:, 2]
-    assert 50 < rows[0] <= 100  # measured 90
+    steps = plan.grid.steps(plan.vertices[plan.triangles].min(axis=1)[:, 0], 0)[plan.order]
+    keys = plan.rows.astype(np.int64) * (int(plan.grid.last[0]) + 1) + steps
+    assert (np.diff(keys) >= 0).all()
+
+
+def test_there_are_no_more_rows_than_allowed_and_more_than_half_of_them():
+    plan = plan_crossings(*scattered(700, sizes=MANY_SMALL_TRIANGLES), most_rows=100)
+    assert 50 < plan.grid.rows <= 100  # measured 90
+
+
+def test_long_triangles_among_short_ones_make_rows_wide_enough_for_few_entries():
+    plan = plan_crossings(*scattered(700, sizes=(0.1, 0.1, 0.1, 20.0)))
+    assert 1.2 * 700 < len(plan.order) < 1.8 * 700  # 1.5 where places are random
+
+
+@pytest.mark.every_device
+def test_triangles_that_surely_cut_another_one_are_nearly_all_that_do(device):
+    vertices, triangles = scattered(900)
+    _, cut = CrossingMarks(device, plan_crossings(vertices, triangles)).look()
+    expected = np.unique(find_self_intersections(vertices, triangles))
+    assert set(cut) <= set(expected)
+    assert len(cut) > 0.99 * len(expected)
+
+
+def test_triangles_that_touch_in_a_point_are_not_sure_to_cut(device):
+    vertices = np.array([[0, 0, 0], [4, 0, 0], [0, 4, 0], [1, 1, 0], [1, 1, 4], [2, 1, 4]], np.float32)
+    unsure, cut = CrossingMarks(device, plan_crossings(vertices, np.arange(6, dtype=np.uint32).reshape(2, 3))).look()
+    assert unsure.tolist() == [0, 1]
+    assert len(cut) == 0
+
+
+def test_a_triangle_without_area_is_not_sure_to_cut_what_it_passes_through(device):
+    vertices = np.array([[0, 0, 0], [4, 0, 0], [0, 4, 0], [1, 1, -1], [1, 1, 3], [1, 1, 1]], np.float32)
+    unsure, cut = CrossingMarks(device, plan_crossings(vertices, np.arange(6, dtype=np.uint32).reshape(2, 3))).look()
+    assert unsure.tolist() == [0, 1]
+    assert len(cut) == 0
 
 
 @pytest.mark.oclgrind
@@ -116,16 +163,18 @@ def test_triangles_without_area_are_marked(device):
 @pytest.mark.parametrize("sizes", [(0.3, 1.0, 6.0), (1.0,), (0.02, 40.0)])
 def test_changed_triangles_and_what_they_cut_are_marked_after_each_change(device, sizes):
     vertices, triangles = scattered(900, sizes)
-    marks = follow_crossings(device, vertices, triangles, fewest=1)
+    marks = CrossingMarks(device, plan_crossings(vertices, triangles), spare=20_000)  # room for all changes
     marks.look()
     random = np.random.default_rng(2)
     for count in (20, 10):  # of 2,700 corners: 45 and 25 triangles
         corners = random.choice(len(vertices), count, replace=False)
         vertices[corners] += random.normal(0.0, 3.0, (count, 3)).astype(np.float32)
         is_changed = np.isin(triangles, corners).any(axis=1)
-        rows = marks.look_again(vertices, np.flatnonzero(is_changed))
+        unsure, cut = marks.look_again(vertices, np.flatnonzero(is_changed))
+        rows = np.union1d(unsure, cut)
         expected = pairs(find_self_intersections(vertices, triangles, is_changed))
         assert len(expected) > 0
+        assert set(cut) <= set(np.ravel(list(expected)))
         assert pairs(rows[find_self_intersections(vertices, triangles[rows], is_changed[rows])]) == expected
 
 
@@ -133,7 +182,7 @@ def test_of_some_rows_those_that_cut_each_other_are_marked_by_their_numbers(devi
     vertices, triangles = scattered(900)
     rows = np.flatnonzero(np.arange(900) % 3 > 0)
     marks = follow_crossings(device, vertices, triangles, rows, fewest=1)
-    assert np.array_equal(marks.look(), rows[marked(device, vertices, triangles[rows])])
+    assert np.array_equal(together(marks.look()), rows[marked(device, vertices, triangles[rows])])
 
 
 def test_rows_that_come_back_are_marked_among_all_where_there_is_room_and_where_there_is_none(device):
@@ -143,7 +192,18 @@ def test_rows_that_come_back_are_marked_among_all_where_there_is_room_and_where_
         marks = follow_crossings(device, vertices, triangles, np.arange(700), fewest=1)
         marks.look()
         expected = np.flatnonzero(twin.mark_crossings(vertices, triangles[: back[-1] + 1]))
-        assert set(expected[expected >= 700]) <= set(marks.look_again(vertices, back)) <= set(expected)
+        assert set(expected[expected >= 700]) <= set(together(marks.look_again(vertices, back))) <= set(expected)
+
+
+def test_triangle_that_moves_out_of_another_one_and_back_into_it_cuts_it_only_there(device):
+    vertices = np.array([[0, 0, 0], [4, 0, 0], [0, 4, 0], [1, 1, -1], [1, 1, 3], [2, 1, 3]], np.float32)
+    plan = plan_crossings(vertices, np.arange(6, dtype=np.uint32).reshape(2, 3))
+    marks = CrossingMarks(device, plan, spare=100)  # room for all changes
+    found = [together(marks.look()).tolist()]
+    for triangle, shift in ((1, 9.0), (0, 0.5), (1, -9.0)):
+        vertices[3 * triangle : 3 * triangle + 3] += np.float32(shift)
+        found.append(together(marks.look_again(vertices, np.array([triangle]))).tolist())
+    assert found == [[0, 1], [], [], [0, 1]]
 
 
 def test_change_of_more_triangles_than_there_is_room_for_is_looked_at_anew(device):
@@ -151,7 +211,7 @@ def test_change_of_more_triangles_than_there_is_room_for_is_looked_at_anew(devic
     marks = CrossingMarks(device, plan_crossings(vertices, triangles))
     marks.look()
     moved = vertices[::-1].copy()
-    assert np.array_equal(marks.look_again(moved, np.arange(400)), marked(device, moved, triangles))
+    assert np.array_equal(together(marks.look_again(moved, np.arange(400))), marked(device, moved, triangles))
 
 
 def test_a_triangle_without_area_crosses_nothing(device):
@@ -186,9 +246,11 @@ def test_triangles_that_the_device_does_not_take_have_the_crossings_of_the_host(
 
 def test_progress_of_crossings_is_told_after_each_piece(device):
     told: list[int] = []
+    plan = plan_crossings(*scattered(600))
     steps = Steps(lambda *step: told.append(step[1]), "crossings", 600)
-    marked(device, *scattered(600), piece=256, steps=steps)
-    assert told == [0, 256, 512, 600]
+    CrossingMarks(device, plan).look(piece=256, steps=steps)
+    shares = np.minimum(np.arange(0, len(plan.order) + 256, 256) / len(plan.order), 1.0)
+    assert told == np.floor(600 * shares).astype(int).tolist()
 
 
 def test_progress_of_crossings_may_end_the_work(device):
