@@ -332,7 +332,7 @@
       return;
     }
     if (tool) picks.push(found.point);
-    const place = inSpace(toPatient(found.point)).map((value) => value.toFixed(1)).join(", ");
+    const place = sayPlace(inSpace(toPatient(found.point)));
     const number = !painted ? "" : `, ${nameOf(painted)} ${found.number === null ? "not known" : `${sayNumber(found.number)} mm`}`;
     find("hint").textContent = `${parts[found.part].name}: ${facts.space} (${place}) mm${number}`;
     if (picks.length === { distance: 2, angle: 3 }[tool]) {

@@ -21,5 +21,6 @@ function roundLength(most) {
   return power * [5, 2, 1].find((factor) => factor * power <= most);
 }
 
+const sayPlace = (point) => point.map((value) => (Math.round(10 * value) / 10 || 0).toFixed(1)).join(", ");  // no -0.0
 const sayLength = (mm) => `${mm >= 1 ? mm : mm.toPrecision(1)} mm`;
 const sayMl = (ml) => (ml === null ? "" : `${ml.toPrecision(ml < 1 ? 2 : 4)} ml`);

@@ -84,7 +84,7 @@ async function openSlices(facts, unpack, inSpace, moved) {
       [less(ways[1]), wide / 2, inset], [ways[1], wide / 2, high - inset]]) pen.fillText(sideOf(way), left, top);
     pen.fillStyle = "#000";
     slider.value = state.index[own];
-    const said = inSpace(place()).map((value) => value.toFixed(1)).join(", ");
+    const said = sayPlace(inSpace(place()));
     words.textContent = `${name} ${state.index[own] + 1} / ${shape[own]} · ${valueAt(state.index)} HU · ${facts.space} (${said}) mm`;
   }
 
