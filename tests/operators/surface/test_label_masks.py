@@ -482,7 +482,9 @@ def test_kernels_of_gpus_and_those_of_three_words_an_item_give_the_same_meshes(d
     expected = extract_label_masks(LabelMap(labels, MIRRORED), device=device)
     variants = {**device.kernel_variants, "LANES": lanes, "WORDS_PER_ITEM": words}
     monkeypatch.setattr(device, "kernel_variants", variants)
-    for number, mesh in extract_label_masks(LabelMap(labels, MIRRORED), device=device).items():
+    meshes = extract_label_masks(LabelMap(labels, MIRRORED), device=device)
+    assert sorted(meshes) == sorted(expected) == [3, 7]
+    for number, mesh in meshes.items():
         assert np.array_equal(mesh.triangles, expected[number].triangles)
         assert np.abs(mesh.vertices - expected[number].vertices).max() <= tolerances.TWIN_VERTEX_VOXEL
 

@@ -87,7 +87,9 @@ def test_kernels_of_gpus_and_those_of_three_words_an_item_give_the_same_meshes(
     variants = {**device.kernel_variants, "LANES": lanes, "WORDS_PER_ITEM": words}
     monkeypatch.setattr(device, "kernel_variants", variants)
     label_map = LabelMap(labels.astype(np.uint8 if max(numbers) < 256 else np.uint16), MIRRORED)
-    for number, mesh in extract_labels(volume, label_map, 3, device=device).items():
+    meshes = extract_labels(volume, label_map, 3, device=device)
+    assert sorted(meshes) == sorted({*numbers} - {0})
+    for number, mesh in meshes.items():
         assert_equals_twin(mesh, volume, inside, number=number, iso_value=3)
 
 

@@ -259,10 +259,10 @@ def test_cross_has_three_colours_in_the_picture(page) -> None:
 
 @pytest.mark.parametrize("plane", ["axial", "coronal", "sagittal"])
 def test_slice_is_named_in_its_colour_and_crossed_by_the_colours_of_the_others(page, plane: str) -> None:
-    label = page.find_element("css selector", f"#{plane} .name")
-    own = page.execute_script("return getComputedStyle(arguments[0]).fill", label)
+    label = f"document.querySelector('#{plane} .name')"  # drawn anew with each picture
+    name, own = page.execute_script(f"return [{label}.textContent, getComputedStyle({label}).fill]")
 
-    assert label.text.split()[0] == plane
+    assert name.split()[0] == plane
     assert colors_of_cross(page, plane) == colors_of_cross(page, "scene") - {own}
 
 
