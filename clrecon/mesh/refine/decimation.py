@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from itertools import count as count_from_zero
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,9 @@ _SHARE_SLACK = 0.005
 
 _SHARE_OF_BOUND = 0.93
 """Of the bound within which points are kept while edges collapse: between them it may be a little more."""
+
+_TURNS_OF_ONE = 5
+"""Turns in which the last collapse alone of a place is undone; then the last one at each corner, as few are left."""
 
 IntArray = NDArray[np.integer]
 MakeCollapser = Callable[[Surface, float], Collapser]
@@ -180,7 +184,11 @@ class _Decimation:
         new = self._take_over(np.arange(len(self._names)), np.arange(count))
         marks = self._follow(self._stored, self._faces, new)
         suspects = new if marks is None else list_distinct(np.concatenate(marks.look()))
-        while len(collapses := self._latest_of([*self._find_far(new), *self._find_unsound(suspects, new)])):
+        for turn in count_from_zero():
+            places = [*self._find_far(new), *self._find_unsound(suspects, new)]
+            collapses = self._latest_of(places, at_corners=turn >= _TURNS_OF_ONE)
+            if len(collapses) == 0:
+                break
             vertices = history.name_again(self._names, history.undo(collapses))
             new = self._take_over(vertices, self._given.fans.touching(vertices))
             again = (np.flatnonzero(self._is_face),) if marks is None else marks.look_again(self._stored, new)
@@ -247,14 +255,14 @@ class _Decimation:
             yield used[of_new[piece][~cross.any(axis=0)]]
         yield used[find_coincident(places)][:, None]
 
-    def _latest_of(self, places: list[IntArray]) -> IntArray:
-        """Return the last collapse into any vertex of each place, shape (k, v); none where it is as it was given."""
+    def _latest_of(self, places: list[IntArray], *, at_corners: bool) -> IntArray:
+        """Return the last collapse into any vertex of each place, shape (k, v), or into each, where there is any."""
         latest = self._history.latest()
         lists: list[IntArray] = [np.zeros(0, dtype=np.int64)]
         for names in places:
             collapses = latest[names]
             rounds = np.where(collapses >= 0, self._history.rounds[collapses], -1)
-            lists.append(collapses[np.arange(len(names)), rounds.argmax(axis=1)])
+            lists.append(collapses.ravel() if at_corners else collapses[np.arange(len(names)), rounds.argmax(axis=1)])
         latest_ones = np.unique(np.concatenate(lists))
         return latest_ones[latest_ones >= 0]
 
