@@ -34,7 +34,7 @@ def _scatter(count: int, seed: int) -> tuple[NDArray[np.float32], NDArray[np.uin
 def _check_crossings(device: Device) -> str:
     """Compare the marks of triangles that cut each other; none of these is so flat that float32 cannot tell."""
     vertices, triangles = _scatter(1600, 3)
-    marks = CrossingMarks(device, plan_crossings(vertices, triangles), spare=1000)
+    marks = CrossingMarks(device, plan_crossings(vertices, triangles), spare=10_000)
     unsure, cut = marks.look()
     is_cut = twin.mark_crossings(vertices, triangles)
     require_equal(cut, np.flatnonzero(is_cut), "triangles that cut each other")
