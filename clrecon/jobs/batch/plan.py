@@ -125,7 +125,6 @@ class BatchSettings:
         "draw each case as in a saved view (.view.json) of one scan: from its direction, framed anew, without what lies"
         " at a place in that patient",
         group="make",
-        first=True,
     )
     workers: int | None = option(
         "--workers N", "processes that run cases in parallel (default: one for each device)", group="run", first=True

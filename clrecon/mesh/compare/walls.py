@@ -8,7 +8,9 @@ voxels larger than 1 mm depths are counted in voxels.  Figures are in docs/iso_v
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -224,14 +226,15 @@ def lie_near(
     points: NDArray[np.floating], marked: NDArray[np.bool_], size_mm: float, cells: float
 ) -> NDArray[np.bool_]:
     """Mark points, mm, whose cell of `size_mm` is at most so many cells from the nearest one with a marked point."""
-    from scipy.ndimage import distance_transform_edt
-
-    if not marked.any():
-        return np.zeros(len(points), dtype=bool)
+    reach = math.ceil(cells)
     places = np.floor((points - points.min(axis=0)) / size_mm).astype(np.int64)
-    is_empty = np.ones(places.max(axis=0) + 1, dtype=bool)
-    is_empty[tuple(places[marked].T)] = False
-    return np.asarray(distance_transform_edt(is_empty)[tuple(places.T)] <= cells)
+    size = places.max(axis=0) + 1
+    is_marked, is_near = np.zeros(size + 2 * reach, dtype=bool), np.zeros(size, dtype=bool)
+    is_marked[tuple(places[marked].T + reach)] = True
+    for offset in product(range(2 * reach + 1), repeat=3):
+        if math.dist(offset, (reach,) * 3) <= cells:
+            is_near |= is_marked[tuple(slice(first, first + count) for first, count in zip(offset, size, strict=True))]
+    return is_near[tuple(places.T)]
 
 
 def lie_near_line(points: NDArray[np.floating], line: NDArray[np.float64], distance: float) -> NDArray[np.bool_]:

@@ -190,7 +190,7 @@ def test_picture_on_a_full_disk_is_refused_and_the_older_one_stays(tmp_path, mon
         total, free = 10**9, 100
 
     monkeypatch.setattr("clrecon.system.files.shutil.disk_usage", lambda folder: Usage)
-    with refused(OutputError, "a.png", "MB", "free"):
+    with refused(OutputError, "a.png", "kB", "free"):
         make_picture().save(path)
     assert path.read_bytes() == b"older"
     assert [entry.name for entry in tmp_path.iterdir()] == ["a.png"]
