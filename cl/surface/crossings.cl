@@ -305,9 +305,7 @@ __kernel void enter_triangles(
     names[KEY * (size_t)stride + entry] = (uint)(row * ((int)grid[6] + 1) + step_of(grid, 0, low.x));
     names[FIRST_ROWS * (size_t)stride + entry]
         = (uint)(step_of(grid, 1, low.y) == row % ny) | (uint)(step_of(grid, 2, low.z) == row / ny) << 1;
-    const uint reach = as_uint(high.x - low.x);
-    if (reach > reaches[row])
-        atomic_max(&reaches[row], reach);
+    atomic_max(&reaches[row], as_uint(high.x - low.x));
     const plane flat = plane_of(own.a, own.b, own.c);
     if (!has_area(&flat))
         atomic_or(&marks[entry / 32u], 1u << entry % 32u);

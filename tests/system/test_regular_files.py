@@ -124,7 +124,7 @@ OPENING_MODULES = {
     "reading/dicomweb.py": "its own files of instances",
     "reading/web.py": "a URL, and its own file of it",
     "reading/grids/metaimage.py": "what it has just written",
-    "reading/grids/nifti.py": "a stream that it is given",
+    "reading/grids/grid_file.py": "a stream that it is given",
     "proof/timing.py": "the system",
     "proof/compare/job.py": "what it has just written",
     "proof/compare/page.py": "its own style",
