@@ -22,7 +22,6 @@
  * LANES entries are looked at together: boxes, and sides of both planes, which leave few pairs. */
 #include "include/lanes.h"
 
-
 /* Share of a volume's sum of absolute terms that its rounding does not reach. */
 #define ROUNDING 0x1p-20f
 #define BOTH 3 /* along y and along z: an entry in the first row that its triangle touches */
@@ -212,14 +211,18 @@ static inline int compare_triangles(const triangle one, const triangle two)
     if (count == 2)
         return may_be_folded(a, b, c, d) ? UNSURE : APART;
     const plane here = plane_of(a, b, c), there = plane_of(d, e, f);
-    const int our_a = side_of(&there, a), our_b = side_of(&there, b), our_c = side_of(&there, c);
-    const int its_d = side_of(&here, d), its_e = side_of(&here, e), its_f = side_of(&here, f);
-    int found = max(may_pass(b, c, our_b, our_c, d, e, f), may_pass(e, f, its_e, its_f, a, b, c));
-    if (count == 0 && found != CUT) {
-        found = max(found, max(may_pass(a, b, our_a, our_b, d, e, f), may_pass(c, a, our_c, our_a, d, e, f)));
-        found = max(found, max(may_pass(d, e, its_d, its_e, a, b, c), may_pass(f, d, its_f, its_d, a, b, c)));
+    const int surest = has_area(&here) && has_area(&there) ? CUT : UNSURE;
+    int3 sides = (int3)(side_of(&there, b), side_of(&there, c), side_of(&there, a));
+    int3 its_sides = (int3)(side_of(&here, e), side_of(&here, f), side_of(&here, d));
+    triangle edges = {b, c, a, own.names}, its_edges = {e, f, d, its.names};
+    int found = APART;
+    for (int edge = 0; edge < 3 && found != CUT && (edge == 0 || count == 0); ++edge) {
+        found = max(found, may_pass(edges.a, edges.b, sides.x, sides.y, d, e, f));
+        found = max(found, may_pass(its_edges.a, its_edges.b, its_sides.x, its_sides.y, a, b, c));
+        edges = turned(edges, (int3)(0, 1, 0)), its_edges = turned(its_edges, (int3)(0, 1, 0));
+        sides = sides.yzx, its_sides = its_sides.yzx;
     }
-    return found == CUT && !(has_area(&here) && has_area(&there)) ? UNSURE : found;
+    return min(found, surest);
 }
 
 /* True where a vertex of an entry has moved since. */
@@ -324,8 +327,8 @@ __kernel void enter_triangles(
  *             Races: marks by atomic_or() alone */
 __kernel void mark_crossings(
     __global const float *restrict places, __global const uint *restrict names, __global const float *restrict grid,
-    __global const float *restrict vertices, __global const uint *restrict starts, __global const uint *restrict reaches, __global uint *restrict marks,
-    const uint first, const uint items, const uint older, const uint stride)
+    __global const float *restrict vertices, __global const uint *restrict starts, __global const uint *restrict reaches,
+    __global uint *restrict marks, const uint first, const uint items, const uint older, const uint stride)
 {
     if (get_global_id(0) >= items)
         return;

@@ -134,11 +134,11 @@ def measure_start(job: Job) -> dict[str, Any]:
     return {"ratios": {}, **figures, "bars_s": {"words": 0.5, "picture": 1.5}}
 
 
-SESSIONS = (10, 110)
+SESSIONS = (60, 160)
 MOST_GROWTH_MB = 20.0
 
 
-@case("view-web-sessions", "memory of the server after 10 browsers that looked and left, and after 110; no peer")
+@case("view-web-sessions", "memory of the server after 60 browsers that looked and left, and after 160; no peer")
 def measure_sessions(job: Job) -> dict[str, Any]:
     """Connect, wait for a sharp picture and leave, one browser after another, each in a tab of its own."""
     with _served(job.input.ct_folder(), job) as served:
