@@ -71,7 +71,7 @@ class CortexFit:
     """Where the outer surface of bone lies across the vertices of a mesh, shape (n,) each.
 
     own_cortex_hu: HU of the cortex of components that have constants of their own.
-    states: uint8. Places in `_STATES`; all values below are those of the fit, whatever the state.
+    states: uint8. Places in `_STATES`; all values below are those of the fit, in every state.
     hidden: bool. Badly fitted because thick slices hide the wall.
     shift_mm: From the vertex along its normal, outwards positive.
     thickness_mm: Of the wall; solid bone has at least the depth of a profile.

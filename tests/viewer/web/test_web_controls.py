@@ -18,12 +18,14 @@ class Control(NamedTuple):
 
     chosen: Value of a list; typed: text of a field; None: a click.
     before: Commands that have to be done before.
+    dialog: The one that has to be open; all others are closed.
     """
 
     holds: str
     chosen: str | None = None
     typed: str | None = None
     before: tuple[tuple[str, dict], ...] = ()
+    dialog: str | None = None
 
 
 SURFACE = ("set_mode", {"name": "surface"})
@@ -50,9 +52,9 @@ CONTROLS = {
     "#layouts [data-layout='1+3']": Control("f.layout === '1+3'"),
     "#undo": Control("f.layout === '1'", before=(("set_layout", {"name": "1"}), ("set_layout", {"name": "4"}))),
     "#help": Control("document.getElementById('keys').open"),
-    "#closekeys": Control("!document.getElementById('keys').open"),
-    "#chips button": Control("document.getElementById('certificate').innerText.includes('gaps of 1 to 3 mm')"),
-    "#closecertificate": Control("!document.getElementById('certificate').open"),
+    "#closekeys": Control("!document.getElementById('keys').open", dialog="keys"),
+    "#chips button": Control("document.querySelector('#certificate[open]')?.innerText.includes('gaps of 1 to 3 mm')"),
+    "#closecertificate": Control("!document.getElementById('certificate').open", dialog="certificate"),
     "#views [title='left']": Control("f.camera.position[0] > f.bounds[1][0]"),
     "#distance": Control("f.tool === 'distance'"),
     "#angle": Control("f.tool === 'angle'"),
@@ -107,11 +109,19 @@ def page(view_browser, view_server):
         yield opened
 
 
+ONE_DIALOG = """
+for (const one of document.querySelectorAll("dialog"))
+  if (one.id !== arguments[0]) one.close();
+  else if (!one.open) one.showModal();
+"""
+
+
 @pytest.mark.parametrize(("place", "control"), CONTROLS.items(), ids=CONTROLS)
 def test_control_of_the_page_does_what_it_says(page, place: str, control: Control) -> None:
     from selenium.webdriver.common.keys import Keys
     from selenium.webdriver.support.ui import Select
 
+    page.execute_script(ONE_DIALOG, control.dialog)
     for name, named in control.before:
         page.execute_script("clrecon.run(arguments[0], arguments[1])", name, named)
     wait_for(page, f'const one = document.querySelector("{place}"); return one && !one.disabled && one.offsetWidth')
