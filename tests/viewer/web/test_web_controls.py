@@ -29,6 +29,7 @@ class Control(NamedTuple):
 
 
 SURFACE = ("set_mode", {"name": "surface"})
+FITTED = (SURFACE, ("set_fitted", {"shown": True}))
 PLACE = ("mark_at", {"x": 50, "y": 50, "size": [100, 100], "plane": "axial"})
 CURVE = (
     ("start_tool", {"name": "curve"}),
@@ -38,15 +39,20 @@ CURVE = (
 )
 
 CONTROLS = {
-    # First: the specks of the scan are gone with its table.
-    "#small": Control("f.small_parts === false", before=(("set_iso", {"hu": -150}), ("find_parts", {}))),
+    # The specks of the scan are gone with its table.
+    "#small": Control(
+        "f.small_parts === false",
+        before=(("set_table", {"shown": True}), ("set_iso", {"hu": -150}), ("find_parts", {})),
+    ),
     "#modes [data-mode='mip']": Control("f.mode === 'mip'"),
     "#table": Control("!f.table", before=(("set_iso", {"hu": 300}), SURFACE, ("set_table", {"shown": True}))),
     "#occlusion": Control("f.occlusion"),
     "#perspective": Control("!f.camera.parallel"),
     "#fitted": Control("f.fitted", before=(SURFACE, ("set_fitted", {"shown": False}))),
-    "#shade": Control("f.color_by === 'thickness'", chosen="thickness"),
-    "#offset": Control("!f.fitted && f.offset && document.getElementById('offset').innerText.includes(' mm ')"),
+    "#shade": Control("f.color_by === 'thickness'", chosen="thickness", before=FITTED),
+    "#offset": Control(
+        "!f.fitted && f.offset && document.getElementById('offset').innerText.includes(' mm ')", before=FITTED
+    ),
     "#layouts [data-layout='1']": Control("f.layout === '1'"),
     "#layouts [data-layout='4']": Control("f.layout === '4'"),
     "#layouts [data-layout='1+3']": Control("f.layout === '1+3'"),
@@ -67,32 +73,32 @@ CONTROLS = {
     "#hide": Control("document.getElementById('hide').ariaPressed === 'true'"),
     "#spine": Control("document.getElementById('hint').textContent.includes('no spine')", before=(("end_tool", {}),)),
     "#along": Control("!document.getElementById('curve').clientWidth", before=CURVE),
-    "#measures button": Control("Math.abs(f.cross[0] - f.measures[0].points[0][0]) < 30"),
+    "#measures button": Control("Math.abs(f.cross[0] - f.measures[0].points[0][0]) < 30", before=(PLACE,)),
     "#clear": Control("f.measures.length === 0", before=(PLACE,)),
     "#exports [data-format='.csv']": Control("saved.textContent.includes('view.csv')", before=(PLACE,)),
-    "#exports [data-format='.json']": Control("saved.textContent.includes('view.json')"),
-    "#exports [data-format='.mrk.json']": Control("saved.textContent.includes('view.mrk.json')"),
+    "#exports [data-format='.json']": Control("saved.textContent.includes('view.json')", before=(PLACE,)),
+    "#exports [data-format='.mrk.json']": Control("saved.textContent.includes('view.mrk.json')", before=(PLACE,)),
     "#all": Control("f.parts.every(({ visible }) => visible)", before=(("show", {"key": "2", "visible": False}),)),
     "#colors": Control("f.parts.some(({ kind, color }) => kind === 'cluster' && color)"),
     "#direction": Control("document.getElementById('direction').value === 'superior'", chosen="superior"),
-    "#cut": Control("f.clips.some(({ name }) => name === 'superior')"),
+    "#cut": Control("f.clips.some(({ name }) => name === document.getElementById('direction').value)"),
     "#boxed": Control("f.clip_box"),
     "#level": Control("f.window[0] + f.window[1] === 80", typed="40"),
     "#width": Control("f.window[1] - f.window[0] === 400", typed="400"),
     "#presets button": Control("f.window[0] === -450 && f.window[1] === 1050"),
     "#thick": Control("f.slab.mm === 8", typed="8"),
-    "#combine": Control("f.slab.combine === 'max'", chosen="max"),
+    "#combine": Control("f.slab.combine === 'max'", chosen="max", before=(("set_slab", {"thickness": 8}),)),
     "#straighten": Control("!f.turned", before=(("turn_cross", {"plane": "axial", "degrees": 20}),)),
     "#hu": Control("f.iso.hu === 305", typed="\ue014"),  # the arrow key to the right moves the slider
     "#exact": Control("f.iso.hu === 333", typed="333"),
     "#format": Control("document.getElementById('format').value === '.view.json'", chosen=".view.json"),
-    "#save": Control("saved.textContent.includes('view.view.json')"),
+    "#save": Control("saved.textContent.includes('view' + document.getElementById('format').value)"),
     "#photo": Control("saved.textContent.includes('view.png')"),
     "#link": Control("saved.querySelector('a')?.href.includes('view=')"),
-    "#compare": Control("f.compare === 0.5"),
-    "#divide": Control("f.compare === 0.505", typed="\ue014"),
+    "#compare": Control("f.compare === 0.5", before=(("set_compare", {"share": None}),)),
+    "#divide": Control("f.compare === 0.505", typed="\ue014", before=(("set_compare", {"share": 0.5}),)),
 }
-"""Controls by their place on the page, in the order in which they are driven."""
+"""Controls by their place on the page: each brings what it needs, as workers of pytest-xdist share them out."""
 
 OF_OTHER_TESTS = {"another", "pickfiles"}
 """Of the start page."""
