@@ -171,8 +171,7 @@ def _label(cells: Cells, mask: Mask) -> _Pieces:
 def find_dense_pieces(cells: Cells, tissue: Mask, thick: Mask, body: Mask) -> DensePieces:
     """Decide for every dense piece whether it belongs to the body and whether it counts as bone.
 
-    tissue, thick: Cells (ck, cj, ci) that are not air, and the thick ones among these.
-    body: Cells found by their thickness, without margin; perhaps none.
+    tissue, thick, body: Cells (ck, cj, ci) that are not air, the thick ones, and those found by their thickness.
     """
     solid = cells.mean > SOLID_HU
     soft = thick & ~spread_mask(solid, 2)

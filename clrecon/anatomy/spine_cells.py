@@ -41,10 +41,7 @@ def heights(mm: float) -> int:
 
 @dataclass(frozen=True)
 class Lattice:
-    """Where the cells of a volume lie, along x, y, z from the centre of the first one, LPS mm.
-
-    block: Voxels that are averaged, along i, j, k.
-    """
+    """Where cells, `block` voxels along i, j, k, lie along x, y, z from the centre of the first one, LPS mm."""
 
     block: NDArray[np.int64]
     count: NDArray[np.int64]

@@ -180,7 +180,6 @@ class SpineLine:
 
     @property
     def ends(self) -> dict[str, SpineEnd | None]:
-        """The ends by name: ``upper`` and ``lower``."""
         return {"upper": self.upper, "lower": self.lower}
 
     @property

@@ -130,7 +130,6 @@ def _describe_step(step: dict[str, Any]) -> str:
 
 
 def _describe_removed(report: dict[str, Any]) -> list[str]:
-    """Name the labels of the file of removed points."""
     if not report["removed_labels"]:
         return []
     names = ", ".join(f"{entry['label']} {entry['reason']}" for entry in report["removed_labels"])

@@ -320,7 +320,6 @@ def add_input(parser: argparse.ArgumentParser, text: str = SCAN, nargs: str | No
 
 
 def add_reading(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say which part of an input is read."""
     add_fields(parser.add_argument_group("reading"), InputSettings, "reading")
 
 

@@ -104,7 +104,6 @@ def _settings(options: argparse.Namespace) -> ViewSettings:
 
 
 def _check_faces(options: argparse.Namespace) -> None:
-    """Refuse options that say two things, or nothing."""
     faces = {"--window": options.window, "--html": options.html, "--picture": options.picture}
     given = [name for name, value in faces.items() if value]
     if len(given) > 1:

@@ -93,7 +93,7 @@ def stage_content(
 ) -> AbstractContextManager[StagedFile]:
     """Write contents under a temporary name (`stage_file`); `counted`, `others` are words in a message of its limit.
 
-    pieces: The contents piece by piece; `content` then has their counts alone.
+    With `pieces` these are written, and `content` has their counts alone.
     """
     code = chosen.code
     expected_bytes = code.estimate(content)

@@ -326,10 +326,7 @@ def _add_mesh(
     *,
     joins: bool,
 ) -> int:
-    """Add the triangles of a mesh; return the number of its primitives that are no triangles.
-
-    names: Of the numbers at vertices, by the attribute that has them.
-    """
+    """Add the triangles of a mesh, with the numbers in `names`; return how many of its primitives are none."""
     mesh = file.entry("meshes", node["mesh"])
     name = str(node.get("name") or mesh.get("name") or "")
     if not joins and name == _NAMELESS:
@@ -417,7 +414,6 @@ def _place_of(node: dict[str, Any]) -> NDArray[np.float64]:
 
 
 def _matrix(numbers: Any) -> NDArray[np.float64]:
-    """Return a matrix that is written column by column."""
     return np.array(numbers, dtype=np.float64).reshape(4, 4).T
 
 

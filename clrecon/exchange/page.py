@@ -59,10 +59,7 @@ _GZIP = 16 + zlib.MAX_WBITS
 
 @dataclass(frozen=True, eq=False)
 class CodedSurface:
-    """A surface as a page holds it: counts, lowest corner and steps of coordinates, mm, and gzip of the byte planes.
-
-    columns: How many numbers each vertex has.
-    """
+    """A surface as a page holds it: counts, lowest corner and steps of coordinates, mm, gzip of the byte planes."""
 
     vertices: int
     triangles: int
@@ -83,10 +80,7 @@ def encode_surface(
     triangles: NDArray[np.integer],
     numbers: NDArray[np.uint16] | None = None,
 ) -> CodedSurface:
-    """Code a surface of at least one triangle, whose order stays; normals (n, 3) are unit vectors.
-
-    numbers: ndarray, shape (n, k). What vertices have beside their place, in steps.
-    """
+    """Code a surface of one triangle or more, in their order; unit normals (n, 3), `numbers` in steps (n, k)."""
     order, corners = _renumber(triangles, len(vertices))
     places = vertices[order].astype(np.float64)
     low, high = find_bounds(places)
@@ -259,10 +253,7 @@ def verify(path: Path, content: Content | Assembly) -> None:
 
 
 def _code_values(meshes: Sequence[Content]) -> tuple[list[dict[str, Any]], NDArray[np.uint16]]:
-    """Return names, steps and scales of the numbers in mm at the vertices, and these, (n, k), in steps of their range.
-
-    Where none is known it is `STEPS`.
-    """
+    """Return names, steps and scales of the numbers in mm at vertices, and these (n, k) in steps, unknown `STEPS`."""
     joined = join_numbers([(mesh.values, len(mesh.vertices)) for mesh in meshes])
     columns: list[dict[str, Any]] = []
     codes = [np.empty((sum(len(mesh.vertices) for mesh in meshes), 0), np.uint16)]

@@ -167,10 +167,7 @@ _PIECE = 1 << 16
 
 @dataclass
 class Element:
-    """An element of a file: its rows, their numbers by name, and their lists by name (types of count and entries).
-
-    leading: Number of numbers before the first list.
-    """
+    """An element: rows, numbers by name, lists by name (types of count and entries), numbers before the first list."""
 
     name: str
     count: int

@@ -72,7 +72,6 @@ class RawCloud:
         return normals.astype(np.float32)
 
     def hu(self) -> NDArray[np.float32] | None:
-        """Return the HU, shape (n,), or None."""
         for rank, name in enumerate(_HU_NAMES):
             columns = self._take([name])
             if columns is not None:

@@ -31,8 +31,6 @@ LONGEST_TEXT = 1 << 20
 
 @dataclass
 class Document:
-    """A file's XML, and the data behind it."""
-
     root: ElementTree.Element
     appended: bytes
     base64: bool
@@ -70,7 +68,7 @@ def read_arrays(document: Document, piece: ElementTree.Element, kind: str, count
 
 
 def read_fields(document: Document) -> tuple[dict[str, tuple[str, ...]], dict[str, NDArray[Any]]]:
-    """Return the field arrays: texts, and numbers."""
+    """Return the texts and the numbers of the field arrays."""
     texts: dict[str, tuple[str, ...]] = {}
     numbers: dict[str, NDArray[Any]] = {}
     for array in document.root.iterfind("PolyData/FieldData/*"):

@@ -15,19 +15,10 @@ _ELSEWHERE = {"slices_missing": ("dropped",), "rescale": ("padding_share", "padd
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Certificate(Record):
-    """The facts about a volume that was read: its ``volume.report``. See docs/contract.md and docs/certificate.md.
+    """The facts about a volume that was read: its ``volume.report``; docs/contract.md explains the entries.
 
-    Lengths are mm, angles degrees.  None means that the file does not tell, that it was refused, or that only pixels
-    tell and they were not read.
-
-    extent_mm: Size of the box of whole voxels along rows, columns and the slice normal.
-    gap_mm: ``min``, ``max`` and ``median`` distance of neighbouring slices along the normal.
-    slice_positions_mm: (slices, 3), LPS mm, where slices are uneven.
-    slice_thickness_mm, stated_gap_mm: As the headers state them; not used for the geometry.
-    padding_share, padding_hu: Of the voxels that hold no measurement, and their HU in the volume.
-    hu_range: Lowest and highest value in the volume, padding included.
-    masked: Facts about what was done after reading: parts that were turned into air (``remove_table``,
-        ``field_of_view``, ``outside_air``) and filters (``filtered``); each is an entry of its own.
+    Lengths are mm, angles degrees.  None means that the file does not tell, that it was refused, or that only
+    pixels tell and they were not read.  Each of `masked`, what was done after reading, is an entry of its own.
     """
 
     _SHOWN = ("format", "shape_ijk", "spacing_mm")

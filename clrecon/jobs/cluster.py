@@ -171,10 +171,7 @@ class Cluster:
 def open_cluster(
     address: str, devices: Sequence[str | None], warn: Callable[[str], None] = lambda text: None
 ) -> Iterator[Cluster]:
-    """Connect to a scheduler, or start one here with a worker for each of these devices; all end with the block.
-
-    warn: Gets what the user should know, such as that there are no workers to wait for.
-    """
+    """Connect to a scheduler, or start one here with a worker for each of these devices; all end with the block."""
     distributed = import_package("distributed", name_parameter("scheduler", address))
     import logging
 

@@ -59,11 +59,7 @@ def _make_screw(numbers: list[float], space: str, name: str, label: str | None) 
 
 
 def read_screws(path: str | Path, space: str) -> tuple[Screw, ...]:
-    """Read screws from a file; its first character tells JSON from CSV.
-
-    JSON is a list of objects with ``entry`` and ``tip`` (three numbers each, mm of `space`), ``diameter`` and, if
-    wanted, ``name`` and ``label``; or an object with such a list as ``screws``.
-    """
+    """Read screws from a file of JSON or CSV, told by its first character; docs/corridor.md describes both."""
     shown = escape_text(Path(path).name)
     try:
         text = read_regular(path, _LARGEST_FILE).decode("utf-8-sig")
@@ -307,7 +303,6 @@ def _write_meshes(
     vertebrae: Mapping[int, Mesh],
     output: str | Path,
 ) -> list[dict[str, Any]]:
-    """Write vertebrae and cylinders; return their entries."""
     meshes: dict[str, Mesh] = {}
     for (number, vertebra), grades in zip(corridors.items(), graded, strict=True):
         meshes[vertebra.name] = vertebrae[number]

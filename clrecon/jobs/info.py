@@ -13,10 +13,8 @@ from clrecon.system.records import name_schema
 
 
 class InputListing(NamedTuple):
-    """The listing of an input.
+    """The listing of an input, as docs/contract.md has it.
 
-    listing: ``{"series": [...], "chosen": number or None, "certificate": {...} or None}``; ``certificate`` is that of
-        the series that was judged, refused or not.
     notes: Files that were passed over, series that were not chosen, and why none is chosen.
     problem: Why the command fails: no series can be used, the requested one cannot, or a gate failed.
     refused: Number of the series that was judged and cannot be used.

@@ -71,13 +71,10 @@ def check_files(*owned: Sequence[tuple[str, str | Path]]) -> None:
 
 
 def check_kept(outputs: Sequence[tuple[str, str | Path | None]], *inputs: str | Path | None) -> None:
-    """Refuse outputs that would replace files that the job reads, under any name or link.
+    """Refuse outputs, files or folders, that would replace files that the job reads, under any name or link.
 
-    Files with the mark of DICOM are never replaced (`clrecon.system.files`). This function protects data sets without
-    the mark, files of other formats with their voxel files, and files with settings.
-
-    outputs: An output can be a folder that is replaced as a whole.
-    *inputs: None and "" are ignored.
+    Files with the mark of DICOM are never replaced (`clrecon.system.files`). This function protects data sets
+    without the mark, files of other formats with their voxel files, and files with settings.
     """
     there = [(what, path) for what, path in outputs if path is not None and os.path.exists(path)]
     read = [path for one in inputs if one and there for path in (one, _find_voxels(one)) if path]

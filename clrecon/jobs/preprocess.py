@@ -212,7 +212,6 @@ def _mask_of(
 
 
 def _line_of(volume: Volume, rule: options.RegionRule, facts: dict[str, Any]) -> Any:
-    """Return the centre line of a tube, LPS mm."""
     from clrecon.anatomy.spine_line import find_spine_line
 
     if rule.path is not None:

@@ -372,7 +372,6 @@ class Run(Laps):
         """Compose a report of this kind: a `ScanReport` has the certificate of `volume`, a `RunReport` the device `on`.
 
         warnings, before: Those of the job that come after and before those of the volume.
-        **own: Entries that `kind` declares.
         """
         certificate = {} if volume is None else self.certificate(volume)
         self.logged = certificate.pop("warnings", ())
@@ -400,10 +399,7 @@ class Run(Laps):
 
 
 class ArchiveTarget:
-    """An archive that gets the results of a run, each with the patient, the study and the slices of its scan.
-
-    source: The input as a path that stays until the end of the run.
-    """
+    """An archive that gets the results of a run, each with patient, study and slices of the scan at `source`."""
 
     def __init__(self, url: str, source: str | Path, run: Run):
         from clrecon.reading.dicom.storing import read_origin

@@ -24,11 +24,6 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StatsReport(ScanReport):
-    """Report of `measure_stats`.
-
-    resampled: The map was brought to the grid of the scan, and its voxels do not all coincide with those of the scan.
-    """
-
     SCHEMA = "stats"
 
     labels: list[LabelFigures]

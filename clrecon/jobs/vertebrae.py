@@ -55,10 +55,7 @@ def make_vertebrae(
     store: str | None = None,
     **how: Any,
 ) -> VertebraeReport:
-    """Read a CT series, find its vertebrae, and write a label map, and a PNG, by default beside it.
-
-    store: URL of a DICOMweb archive that gets the label map too, before any file is in its place.
-    """
+    """Read a CT series, find its vertebrae, and write a label map, and a PNG, by default beside it."""
     from clrecon.spine import split_vertebrae
 
     settings = settings or VertebraeSettings()
@@ -119,7 +116,6 @@ def make_vertebrae(
 
 
 def _check_formats(source: str | Path, output: str | Path, picture: str | Path | None) -> None:
-    """Refuse names of files that say another format."""
     kind = map_format(output)
     if kind in _NIFTI:
         load_nibabel()

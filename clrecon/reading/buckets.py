@@ -184,7 +184,6 @@ _METADATA = ("169.254.169.254", "metadata.google")
 
 
 def _find_advice(name: str) -> str:
-    """Return the variables for the credentials of a bucket."""
     scheme = name.partition(":")[0].lower()
     if scheme in ("s3", "s3a"):
         return "AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_SKIP_SIGNATURE=true for a public bucket,"

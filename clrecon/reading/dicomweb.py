@@ -37,8 +37,6 @@ _BOUNDARY = re.compile(r"[0-9A-Za-z'()+_,./:=? -]{0,69}[0-9A-Za-z'()+_,./:=?-]")
 
 
 class Instances:
-    """The instances of a study or a series in an archive."""
-
     def __init__(self, parts: SplitResult, patience: Patience = Patience()):  # noqa: B008 (a tuple)
         self._url, self._patience = web_url(parts), patience
         self._name = shown_url(parts.geturl())
@@ -183,10 +181,7 @@ def _kind_of(headers: Message) -> str:
 
 
 class Multipart:
-    """A body of parts, split at its boundary while it arrives; the lengths that parts state play no role.
-
-    pieces: The body; each step keeps less than two of them.
-    """
+    """A body of parts, split at its boundary as its `pieces` arrive; the lengths that parts state play no role."""
 
     def __init__(self, pieces: Iterator[bytes], boundary: bytes, name: str):
         self._pieces, self._name = pieces, name

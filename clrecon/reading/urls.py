@@ -99,7 +99,6 @@ def shown_url(url: str) -> str:
 
 
 def web_url(parts: SplitResult) -> str:
-    """Return the URL that is asked for over HTTP, in ASCII."""
     path, query = (quote(text, safe="%/:;,=&?~+!$'()*@[]-._") for text in (parts.path or "/", parts.query))
     return parts._replace(scheme=parts.scheme.removeprefix("dicomweb+"), path=path, query=query, fragment="").geturl()
 

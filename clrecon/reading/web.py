@@ -109,18 +109,13 @@ class Answer:
 
 
 class Content(NamedTuple):
-    """What is sent to a server."""
-
     kind: str
     data: bytes
 
 
 @contextmanager
 def ask_server(url: str, accept: str, patience: Patience, content: Content | None = None) -> Iterator[Answer]:
-    """Ask for a URL and give the answer, where there is one; redirections to other hosts get no credentials.
-
-    content: Is sent along, and to no other place than this URL.
-    """
+    """Ask for a URL and give the answer; redirections to other hosts get no credentials, none gets the `content`."""
     origin, target = _origin(urlsplit(url)), url
     for _ in range(_MOST_REDIRECTS + 1):
         parts = urlsplit(target)
@@ -215,7 +210,6 @@ def _find_password(host: str) -> str | None:
 
 
 def _refuse_status(response: Any, parts: SplitResult, *, has_credentials: bool) -> None:
-    """Raise the error of a status other than success."""
     status, host = response.status, parts.netloc
     if status in (200, 204):
         return

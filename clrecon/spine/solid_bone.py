@@ -196,8 +196,6 @@ def fill_vertebra(
 ) -> SolidBone:
     """Make the solid bone of one label on the volume's own grid; `subject` names it in messages.
 
-    With `fitted` its surface is the one that was fitted to the bone, from that at the level on.
-
     Inside is what has the level, HU, and is the label's own (or one voxel beyond), and what that encloses, see
     `clrecon.labels.label_levels.fill_solid`.  The canal is open above and below, and so stays outside.
     """

@@ -56,7 +56,7 @@ def physical_memory_bytes() -> float:
 def allocate_voxels(shape: Sequence[int], dtype: DTypeLike, name: str = "", *, may_map: bool = False) -> NDArray[Any]:
     """Return an uninitialised array for a volume (nk, nj, ni), see `aligned_empty`; `name` is that of the file.
 
-    may_map: An array that is larger than the free memory is mapped from a temporary file.
+    If it `may_map`, an array that is larger than the free memory is mapped from a temporary file.
     """
     needed = math.prod(shape) * np.dtype(dtype).itemsize
     available = available_memory_bytes()

@@ -112,7 +112,6 @@ def unmeasured(name: str, bound: float | bool, unit: str | None, why: str) -> Ga
 
 
 def failed_gates(gates: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Return one line for each gate that was measured and not kept."""
     return [f"gate {gate['name']} failed: {gate['text']}" for gate in gates if gate["ok"] is False]
 
 

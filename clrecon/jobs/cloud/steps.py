@@ -41,10 +41,7 @@ def take_points(
     progress: Progress,
     ghosts: GhostSlices | None = None,
 ) -> CloudSteps:
-    """Make the cloud of a volume, or take one that was read, and run the steps on it.
-
-    ghosts: Of the scan before it was masked; None: they are looked for in the volume.
-    """
+    """Make the cloud of a volume, or take one that was read, and run the steps; `ghosts` are of the unmasked scan."""
     from clrecon.operators.resident.device_volume import DeviceVolume
 
     if not isinstance(subject, Volume):

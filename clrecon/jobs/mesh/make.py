@@ -68,10 +68,9 @@ def make_parts(
     check_map: Callable[[LabelMap], None] | None = None,
     extract: Callable[[Volume, Sequence[Surface], Device], list[Mesh]] | None = None,
 ) -> MadeParts:
-    """Read a scan, extract its surfaces and select components.
+    """Read a scan, extract its surfaces, by `extract` in place of `extract_surfaces`, and select components.
 
-    check_map: Gets the label map before any work.
-    extract: In place of `extract_surfaces`.
+    `check_map` gets the label map before any work.
     """
     settings: MeshSettings = run.settings
     (volume, labels), device = _read_inputs(source, run, check_map)

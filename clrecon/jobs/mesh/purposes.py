@@ -57,10 +57,7 @@ def settings_for(name: str | None, given: dict[str, Any]) -> dict[str, Any]:
 
 
 def mesh_fields(options: Mapping[str, Any], labels_by: str = "") -> dict[str, Any]:
-    """Return the fields of `MeshSettings` that options give, by their names, None for those that are not given.
-
-    A message says `labels_by` what a label map comes: by default its option.
-    """
+    """Return the fields of `MeshSettings` that options give; a message says `labels_by` what a label map comes."""
     given = pick_fields(MeshSettings, options)
     given |= given.pop("iso_value", {})  # one of two fields
     needs = f"says how labels become meshes: give their file {labels_by or 'with ' + name_parameter('labels', 'FILE')}"

@@ -167,10 +167,7 @@ def refine_and_measure(
     lap: Callable[[str], object],
     progress: Progress = ignore_progress,
 ) -> None:
-    """Refine the parts and, if asked, measure them: of a print those that lie too far again, within a tighter bound.
-
-    lap: Called with the name of each stage that is done.
-    """
+    """Refine the parts and, if asked, measure them: of a print those that lie too far again, within a tighter bound."""
     turns = len(_PRINT_BOUNDS) if _is_tightened(settings) else 1
     parts = result.parts
     for turn in range(turns):
@@ -191,7 +188,6 @@ def refine_and_measure(
 
 
 def _is_tightened(settings: MeshSettings) -> bool:
-    """Tell whether the bound of decimation follows from the gates."""
     bounded = settings.decimate_used is not None and settings.method != "g-mc"
     return settings.is_for_print and bounded and settings.max_deviation_mm is None
 

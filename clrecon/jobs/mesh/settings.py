@@ -89,7 +89,6 @@ SCAN_GATE_FAILED, GATE_FAILED = 7, 8
 
 
 def _describe_purpose(purpose: Purpose) -> str:
-    """Describe a purpose by the options that it stands for."""
     words = []
     for field, value in purpose.settings.items():
         words.append(f"--{field.replace('_', '-')}")

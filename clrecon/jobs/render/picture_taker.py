@@ -145,14 +145,12 @@ class PictureTaker(Closing):
         return self.style.light if isinstance(self.style, shaded) else None
 
     def take_views(self) -> Iterator[Rendering]:
-        """Yield the picture of each of `views`, in their order."""
         if len(self._takers) > 1 and not isinstance(self.style, CurveCut):
             for taker in self._takers:
                 taker._box = self.box  # found once
         yield from deal_in_order([taker.take_view for taker in self._takers], self.views)
 
     def take_all(self, cameras: Sequence[Camera]) -> Iterator[Rendering]:
-        """Yield the picture of each camera, in their order."""
         yield from deal_in_order([taker.take for taker in self._takers], cameras)
 
     def take_view(self, view: str) -> Rendering:

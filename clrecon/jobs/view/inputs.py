@@ -76,10 +76,7 @@ def open_inputs(
     ready: Callable[[OpenedInput], None] | None = None,
     read: Reader = read_selected,
 ) -> list[OpenedInput]:
-    """Read the inputs of a view, the label map of its settings last; `ready` gets each input as soon as it is read.
-
-    read: Of scans, with the arguments of `read_selected`.
-    """
+    """Read the inputs of a view, its label map last; `ready` gets each as soon as it is read, a scan by `read`."""
     settings, tell = settings or ViewSettings(), progress or ignore_progress
     labels = settings.scan.labels
     if not inputs and labels is None:

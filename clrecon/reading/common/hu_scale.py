@@ -49,7 +49,6 @@ class ValueSample:
         return float(end - first) / len(self.values)
 
     def median_between(self, low: float, high: float) -> float:
-        """Return the median of the values with ``low <= value < high``, of which there must be some."""
         first, end = np.searchsorted(self.values, (low, high))
         return float(self.values[(first + end) // 2])
 

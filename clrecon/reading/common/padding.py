@@ -168,10 +168,7 @@ def _is_disc(picture: NDArray[Any], value: Any, distance: NDArray[np.float64]) -
 def count_masked_tissue(
     ends: tuple[float, float], header: StoredValues, stored: NDArray[Any], padding: NDArray[np.bool_]
 ) -> int:
-    """Count voxels of the padding of a slice (rows, columns) that are tissue by their stored value and place.
-
-    `ends`: the lowest and the highest stored value that are padding.
-    """
+    """Count voxels of a slice's padding, stored values between `ends`, that are tissue by their value and place."""
     low, high = ends
     # Padding below air is the usual case and needs no search.  NaN is not above air either.
     if not max(low * header.slope, high * header.slope) + header.intercept > AIR_RANGE_HU[1]:

@@ -55,18 +55,7 @@ class StoredRange(NamedTuple):
 
 @dataclass(frozen=True)
 class SeriesEntry:
-    """One line of a listing; `as_dict` is the documented machine-readable form (docs/contract.md).
-
-    number: From 1, the value that ``series=`` takes.
-    patient, study: From 1, among those found; identifiers are not given.  None where the files do not tell.
-    kind: {"stack", "localizer", "capture", "other"}. Only stacks are read.
-    phases: ``{"number", "keyword", "value", "slices"}`` of each volume, where slices share places; else empty.
-    slices: Number of images, with copies and all phases.
-    uid_hash: First 16 hexadecimal digits of the SHA-256 of the SeriesInstanceUID.
-    gap_mm: "min", "max" and "median" distance of neighbouring slices along the normal.
-    extent_mm: Size of the box of whole voxels along rows, columns and the slice normal.
-    dropped: Maps a reason to the number of slices left out of the stack.
-    """
+    """One line of a listing; docs/contract.md explains the entries, and `as_dict` is their machine-readable form."""
 
     _SHOWN = ("number", "modality", "slices", "shape_ijk", "spacing_mm")
     number: int

@@ -52,10 +52,7 @@ def read_origin(path: str | os.PathLike[str], selection: Selection) -> Origin:
 
 
 def encode_model(stl: bytes, origin: Origin, title: str, *, is_modified: bool) -> tuple[str, bytes]:
-    """Return the UID and the bytes of an Encapsulated STL; the same mesh of the same scan has the same UID.
-
-    is_modified: The surface was changed after it was found: smoothed, filled and the like.
-    """
+    """Return the UID, the same for the same mesh of a scan, and the bytes of an Encapsulated STL."""
     from pydicom.dataset import FileDataset, FileMetaDataset
     from pydicom.uid import ExplicitVRLittleEndian
 
@@ -91,7 +88,6 @@ def encode_model(stl: bytes, origin: Origin, title: str, *, is_modified: bool) -
 
 
 def copy_patient(target: Any, origin: Origin) -> None:
-    """Copy what names the patient and the study of a scan."""
     for keyword in (*_PATIENT, *_STUDY):
         setattr(target, keyword, origin.header.get(keyword, ""))
     for keyword in _MORE:

@@ -46,10 +46,7 @@ _UNPACKING_ERRORS: tuple[type[Exception], ...] = (EOFError, OSError, isal_zlib.e
 
 
 class VoxelSource(Protocol):
-    """Where the numbers of a grid are: in a file (`VoxelBytes`), or in the chunks of a folder.
-
-    file_bytes: Stored bytes, from which `check_size` tells whether the grid can be there.
-    """
+    """Where the numbers of a grid are, as `file_bytes` stored: in a file (`VoxelBytes`), or in chunks of a folder."""
 
     @property
     def path(self) -> Path: ...

@@ -231,7 +231,6 @@ def _read_affine(
 
 
 def _explain_units(axes: Sequence[Mapping[str, Any]], spatial: Sequence[int], kinds: Sequence[str], name: str) -> str:
-    """Say why the distance of the voxels is not known."""
     if "scale" not in kinds:
         return f"{name} does not say how far apart its voxels are, it has no scale"
     axis = next(axes[axis] for axis in spatial if str(axes[axis].get("unit")).lower() not in _MM_PER_UNIT)

@@ -66,7 +66,6 @@ _OTHER_NAMES = {
 
 
 def is_encapsulated(transfer_syntax: str) -> bool:
-    """True for compressed pixel data."""
     return transfer_syntax not in _NATIVE_SYNTAXES
 
 

@@ -279,7 +279,6 @@ def collect_scan_warnings(scan: Scan) -> list[str]:
 
 
 def collect_series_warnings(series: Series) -> list[str]:
-    """Return warnings about one series, from its headers and its geometry."""
     if series.stack is None or series.kind == "other":
         return []
     headers = series.stack.slices
@@ -407,8 +406,7 @@ def certify(
 ) -> Certificate:
     """Build the certificate of a series: the report of its volume, and what ``clrecon info`` shows.
 
-    pixels: None: they were not read, and entries that depend on them are None.
-    affine: None: the series is refused.
+    Without `pixels` the entries that depend on them are None; without an `affine` the series is refused.
     """
     facts = None if pixels is None else pixels.facts
     likeness = None if pixels is None else pixels.likeness
