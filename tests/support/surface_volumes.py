@@ -56,10 +56,10 @@ MIDDLE = np.array([19.5, 19.0, 18.0])
 
 
 def hollow_ball(
-    *, radius: float = 13.0, thickness: float = 2.0, blur: float = 0.7, cortex: float = 1000.0, inner: float = 200.0,
-    spacing: Sequence[float] = (1.0, 1.0, 1.0),
+    *, radius: float = 13.0, thickness: float | np.ndarray = 2.0, blur: float = 0.7, cortex: float = 1000.0,
+    inner: float = 200.0, spacing: Sequence[float] = (1.0, 1.0, 1.0),
 ) -> Volume:  # fmt: skip
-    """A blurred shell of bone in tissue of 50 HU, its middle at `MIDDLE` mm."""
+    """A blurred shell of bone in tissue of 50 HU, its middle at `MIDDLE` mm; its thickness at each voxel, or at all."""
     from scipy.special import ndtr
 
     shape = [round(39.0 / step) + 1 for step in spacing]

@@ -51,15 +51,18 @@ FARTHEST = 8.0
 
 _THICK_SHARE = 0.5
 _CORTEX_STEP = 1.03
-_CLEARLY_LESS = 0.97
+_CLEARLY_LESS, _LESS = 0.97, 0.98
 """Where this share of the walls is thick, the cortex is what leaves least of the profiles, in steps of the second from
 what they show on, down as long as less than the third of it is left: their percentile holds noise, which the blurs
-follow, and it them (11 % too much at 40 HU)."""
+follow, and it them (11 % too much at 40 HU).  Then up, as below, as long as less than the last share is left: vessels
+with contrast medium that count as thick walls are less dense (840 HU for 945)."""
 
 _UPWARD_STEP, _UPWARD_STEPS = 1.04, 8
-_ALMOST = 1.02
+_ALMOST, _STILL_THICK = 1.02, 0.25
 """Where fewer are thick, what blur makes thick is not dense: of so many steps up the first is taken that leaves the
-third times the least or less (with what walls show the surface lay 0.1 mm too far outside at a blur of 1 mm)."""
+third times the least or less (with what walls show the surface lay 0.1 mm too far outside at a blur of 1 mm).  A step
+that leaves less than the last share of the thick walls thick describes them as thin ones before something dense (a
+cone-beam scan: 1,442 HU for 1,096, and 0.1 mm too far inside)."""
 
 STEPPED = 1.5
 """Slices that blur across by more than so often what they blur within make steps of slanted walls: their profiles show
@@ -137,6 +140,7 @@ class _Walls:
     def __init__(self, sampler: ProfileSampler, values: Float32Array, noise: float | None):
         profiles, known = sampler.take(values), SILENT_HU if noise is None else noise
         self.values, self.noise = values, noise
+        self.depth_mm = -sampler.scale.first_mm
 
         def fit_trial(trial: _Trial, spread: float) -> WallFits:
             return profiles.fit(trial.blur_mm, trial.across_mm, trial.cortex_hu, known, cortex_spread=spread)
@@ -312,23 +316,39 @@ def _search(walls: _Walls, volume: Volume) -> tuple[_Trial, int]:
         cortex_hu, thick = _measure_cortex(walls, slice(None), best)
     if not shown:
         return _search_upwards(walls, best._replace(cortex_hu=cortex_hu)), thick
-    while True:
-        candidate = best._replace(cortex_hu=best.cortex_hu / _CORTEX_STEP)
-        candidate = _search_blurs(walls, slice(None), candidate, SEARCH_STEPS[2:])
-        if _left(walls, slice(None), candidate) >= _CLEARLY_LESS * _left(walls, slice(None), best):
-            return best, thick
+    best = _step_cortex(walls, best, 1.0 / _CORTEX_STEP, _CLEARLY_LESS)
+    return _step_cortex(walls, best, _UPWARD_STEP, _LESS) if _may_be_denser(walls, best) else best, thick
+
+
+def _step_cortex(walls: _Walls, best: _Trial, step: float, less: float) -> _Trial:
+    """Return a trial whose cortex was changed by steps as long as each leaves less than this share."""
+    candidate = best
+    while candidate is best or _left(walls, slice(None), candidate) < less * _left(walls, slice(None), best):
         best = candidate
+        candidate = best._replace(cortex_hu=best.cortex_hu * step)
+        candidate = _search_blurs(walls, slice(None), candidate, SEARCH_STEPS[2:])
+    return best
+
+
+def _may_be_denser(walls: _Walls, trial: _Trial) -> bool:
+    """Tell whether profiles could show a denser cortex: not those of solid bone, steps or walls that are alike."""
+    fits = walls.fit(trial, _WIDE_SPREAD)  # a profile that ends within its wall shows nothing of what is inside
+    is_solid = (fits.inner_hu > SOLID_SHARE * trial.cortex_hu) | (fits.thickness_mm > walls.depth_mm)
+    return is_solid.mean() <= 0.5 and trial.across_mm <= STEPPED * trial.blur_mm and not _are_alike(walls, trial)
 
 
 def _search_upwards(walls: _Walls, trial: _Trial) -> _Trial:
     """Return a trial whose cortex describes the profiles, where few walls are thick enough to show it."""
-    is_solid = np.median(walls.fit(trial, _WIDE_SPREAD).inner_hu) > SOLID_SHARE * trial.cortex_hu
-    if is_solid or trial.across_mm > STEPPED * trial.blur_mm or _are_alike(walls, trial):
+    if not _may_be_denser(walls, trial):
         return trial
     trials = [_search_blurs(walls, slice(None), trial, SEARCH_STEPS[2:])]
+    most = _measure_cortex(walls, slice(None), trials[0])[1]
     for _ in range(_UPWARD_STEPS):
         denser = trials[-1]._replace(cortex_hu=trials[-1].cortex_hu * _UPWARD_STEP)
-        trials.append(_search_blurs(walls, slice(None), denser, SEARCH_STEPS[1:]))
+        denser = _search_blurs(walls, slice(None), denser, SEARCH_STEPS[1:])
+        if _measure_cortex(walls, slice(None), denser)[1] < _STILL_THICK * most:
+            break
+        trials.append(denser)
     left = [_left(walls, slice(None), each) for each in trials]
     return next(each for each, value in zip(trials, left, strict=True) if value <= _ALMOST * min(left))
 

@@ -175,13 +175,40 @@ def test_constants_are_taken_from_the_most_walls_allowed_and_many_thick_ones(dev
     assert fit.constants.thick > 100  # measured 500
 
 
+def noisy(volume: Volume, hu: float, seed: int) -> Volume:
+    noise = np.random.default_rng(seed).normal(0.0, hu, volume.voxels.shape)
+    return volume.with_voxels(np.rint(volume.voxels + noise).astype(np.int16))
+
+
+def two_walls(thin: float, thick: float, thin_share: float, **shell: float) -> Volume:
+    """A shell of 1000 HU, a share of which, from its lower pole on, is thin."""
+    height = np.arange(40)[:, None, None] - MIDDLE[2]
+    return hollow_ball(thickness=np.where(height < OUTER_RADIUS * (2.0 * thin_share - 1.0), thin, thick), **shell)
+
+
+def solid_cylinder(radius: float) -> Volume:
+    """Bone of 1000 HU without marrow, tilted against the slices and longer than the volume."""
+    k, j, i = np.indices((44, 44, 44))
+    inside = ndtr((radius - np.hypot(i - 21.7, 0.9 * j + 0.43 * k - 28.0)) / 0.7)
+    return Volume(np.rint(50.0 + 950.0 * inside).astype(np.int16), np.eye(4))
+
+
+# Without what each of them needs 1,232, 1,365 and 853 HU were found.
+HARD_SCANS = {
+    "solid bone": noisy(solid_cylinder(11.0), 20.0, seed=2),  # measured 1,012
+    "few thick walls": noisy(two_walls(2.2, 4.0, 0.7, blur=1.3), 30.0, seed=1),  # 997
+    "thick walls that show too little": noisy(two_walls(0.8, 2.4, 0.4, blur=1.1, inner=400.0), 10.0, seed=1),  # 960
+}
+
+
+@pytest.mark.parametrize("volume", HARD_SCANS.values(), ids=HARD_SCANS)
+def test_cortex_of_1000_hu_is_known_to_a_tenth(device, volume):
+    assert fit_surface(volume, device)[1].constants.cortex_hu == pytest.approx(1000.0, rel=0.1)
+
+
 def test_noise_makes_the_cortex_neither_denser_nor_moves_it(device):
     """Thick walls' percentile holds noise, the blur follows it, and it the blur: 15 % and 0.13 mm inwards."""
-    quiet = hollow_ball(thickness=2.6, blur=0.5)
-    noise = np.random.default_rng(3).normal(0.0, 40.0, quiet.voxels.shape)
-    noisy = quiet.with_voxels(np.rint(quiet.voxels + noise).astype(np.int16))
-
-    mesh, fit = fit_surface(noisy, device, level=500.0)
+    mesh, fit = fit_surface(noisy(hollow_ball(thickness=2.6, blur=0.5), 40.0, seed=3), device, level=500.0)
 
     assert fit.constants.cortex_hu == pytest.approx(1000.0, rel=0.04)  # measured 1013
     assert fit.constants.blur_mm == pytest.approx(np.hypot(0.5, 0.4), abs=0.08)  # with that of the interpolation
