@@ -22,6 +22,7 @@ from clrecon.geometry.iso_rule import IsoRule
 from clrecon.mesh.compare.iso_distance import trilinear_values
 from clrecon.mesh.mesh import Mesh
 from clrecon.system.light_dataclass import dataclass
+from clrecon.system.pieces import find_bounds
 from clrecon.system.records import Record
 
 COMPACT_HU = 600.0
@@ -227,14 +228,19 @@ def lie_near(
 ) -> NDArray[np.bool_]:
     """Mark points, mm, whose cell of `size_mm` is at most so many cells from the nearest one with a marked point."""
     reach = math.ceil(cells)
-    places = np.floor((points - points.min(axis=0)) / size_mm).astype(np.int64)
-    size = places.max(axis=0) + 1
-    is_marked, is_near = np.zeros(size + 2 * reach, dtype=bool), np.zeros(size, dtype=bool)
-    is_marked[tuple(places[marked].T + reach)] = True
+    start, end = find_bounds(points)
+    size = np.floor((end - start) / size_mm).astype(np.int64) + 1
+    numbers: NDArray[np.int64] = np.zeros(len(points), np.int64)
+    for column, first, count in zip(points.T, start, size, strict=True):
+        numbers *= count
+        numbers += np.floor((column - first) / size_mm).astype(np.int64)
+    has_marked, is_near = np.zeros(size, dtype=bool), np.zeros(size, dtype=bool)
+    has_marked.reshape(-1)[numbers[marked]] = True
+    is_marked = np.pad(has_marked, reach)
     for offset in product(range(2 * reach + 1), repeat=3):
         if math.dist(offset, (reach,) * 3) <= cells:
             is_near |= is_marked[tuple(slice(first, first + count) for first, count in zip(offset, size, strict=True))]
-    return is_near[tuple(places.T)]
+    return is_near.reshape(-1).take(numbers)
 
 
 def lie_near_line(points: NDArray[np.floating], line: NDArray[np.float64], distance: float) -> NDArray[np.bool_]:

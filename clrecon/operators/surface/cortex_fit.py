@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,7 +25,7 @@ from clrecon.operators.surface.cortex import (
 )
 from clrecon.operators.surface.cortex_constants import LEAST_CONTRAST, SOLID_SHARE, find_groups, measure_constants
 from clrecon.system.light_dataclass import dataclass
-from clrecon.system.pieces import chunks
+from clrecon.system.pieces import chunks, deal_in_order
 
 _STATES = ("fitted", "not bone", "metal", "badly fitted", "no room")
 """What is across a vertex: a wall; no wall of bone; metal; a profile unlike a wall; another wall or the end of the
@@ -61,6 +63,9 @@ _COARSE_ERROR = 0.031
 """The same of the error that is stated, and the share of step^3 / blur^2 that is added in squares: what interpolation
 between voxels blurs is known as a series of three terms."""
 
+_JUDGES = 2
+"""Threads that judge fits: numpy takes a quarter of the device's time."""
+
 DENSER_ERROR = np.float32(0.5)
 """Standard error of what lies anywhere from as far on the other side up to 1: from the least cortex to the densest
 where half of the way is taken."""
@@ -95,6 +100,10 @@ class CortexFit:
         return {name: int(np.count_nonzero(self.states == state)) for state, name in enumerate(_STATES)}
 
 
+_Fitted = tuple[NDArray[np.intp], CortexConstants, WallFits, Float32Array, Float32Array | None]
+"""Rows of points, their constants, fits, frames, and shifts at the dense end of the constants."""
+
+
 def fit_walls(
     resident: DeviceVolume,
     points: NDArray[np.floating],
@@ -125,31 +134,40 @@ def fit_walls(
     fit = CortexFit(constants, levels, *marks, *(np.empty(count, np.float32) for _ in range(5)))
     if cubic:
         sampler = ProfileSampler(resident, stopwatch, cubic=True)
-    for members, known in groups:
+
+    def fit_pieces() -> Iterator[_Fitted]:
+        for members, known in groups:
+            for piece, values_d in sampler.pieces(points[members], normals[members]):
+                with stopwatch.running(resident.device):
+                    profiles = WallProfiles(sampler, values_d, len(piece))
+                    walls, frames = profiles.fit_with(known), profiles.frames()
+                    denser = None if known.denser is None else profiles.fit_with(known.at_dense_end()).shift_mm
+                yield members[piece], known, walls, frames, denser
+
+    def judge_piece(fitted: _Fitted) -> None:
+        members, known, fits, frames, denser = fitted
         within, across = known.blur_mm**2, known.blur_across_mm**2
-        for piece, values_d in sampler.pieces(points[members], normals[members]):
-            with stopwatch.running(resident.device):
-                profiles = WallProfiles(sampler, values_d, len(piece))
-                fits, frames = profiles.fit_with(known), profiles.frames()
-                denser = None if known.denser is None else profiles.fit_with(known.at_dense_end()).shift_mm
-            for span in chunks(len(piece)):  # products of more rows keep threads of BLAS busy with waiting
-                rows, walls = members[piece[span]], WallFits(*(row[span] for row in fits.rows()))
-                blurs = np.sqrt(within + (across - within) * np.square(normals[rows] @ sampler.frame.normal))
-                hidden = (blurs > _ACROSS * known.blur_mm) & (walls.thickness_mm < _HIDDEN_BLURS * blurs)
-                fit.states[rows] = judge_walls(walls, known, sampler.scale, hidden)
-                around_hu = AIR_HU if known.noise_hu is None else 0.0  # a specimen lies in air
-                rise = np.minimum(LEAST_CONTRAST, _FAINT_MM / blurs) * (known.cortex_hu - around_hu)
-                shows_bone[rows] = walls.peak_hu >= np.minimum(around_hu + rise, FAINT_HU)
-                fit.hidden[rows] = hidden & (fit.states[rows] == BADLY_FITTED)
-                solid_mm = np.float32(-sampler.scale.first_mm) * (walls.inner_hu > SOLID_SHARE * walls.cortex_hu)
-                fit.thickness_mm[rows] = np.maximum(walls.thickness_mm, solid_mm)
-                fit.shift_mm[rows], fit.room_mm[rows] = walls.shift_mm, walls.room_mm
-                fit.spread_mm[rows] = standard_errors(walls, known)
-                steps = sampler.frame.steps_along(normals[rows], frames[1, span])
-                ratios = steps / blurs_of(frames[:, span], known.blur_mm, known.blur_across_mm)
-                fit.error_mm[rows] = standard_errors(walls, known, coarse_mm=steps * ratios * ratios)
-                if denser is not None:
-                    fit.error_mm[rows] = np.hypot(fit.error_mm[rows], DENSER_ERROR * (denser[span] - walls.shift_mm))
+        for span in chunks(len(members)):  # products of more rows keep threads of BLAS busy with waiting
+            rows, walls = members[span], WallFits(*(row[span] for row in fits.rows()))
+            blurs = np.sqrt(within + (across - within) * np.square(normals[rows] @ sampler.frame.normal))
+            hidden = (blurs > _ACROSS * known.blur_mm) & (walls.thickness_mm < _HIDDEN_BLURS * blurs)
+            fit.states[rows] = judge_walls(walls, known, sampler.scale, hidden)
+            around_hu = AIR_HU if known.noise_hu is None else 0.0  # a specimen lies in air
+            rise = np.minimum(LEAST_CONTRAST, _FAINT_MM / blurs) * (known.cortex_hu - around_hu)
+            shows_bone[rows] = walls.peak_hu >= np.minimum(around_hu + rise, FAINT_HU)
+            fit.hidden[rows] = hidden & (fit.states[rows] == BADLY_FITTED)
+            solid_mm = np.float32(-sampler.scale.first_mm) * (walls.inner_hu > SOLID_SHARE * walls.cortex_hu)
+            fit.thickness_mm[rows] = np.maximum(walls.thickness_mm, solid_mm)
+            fit.shift_mm[rows], fit.room_mm[rows] = walls.shift_mm, walls.room_mm
+            fit.spread_mm[rows] = standard_errors(walls, known)
+            steps = sampler.frame.steps_along(normals[rows], frames[1, span])
+            ratios = steps / blurs_of(frames[:, span], known.blur_mm, known.blur_across_mm)
+            fit.error_mm[rows] = standard_errors(walls, known, coarse_mm=steps * ratios * ratios)
+            if denser is not None:
+                fit.error_mm[rows] = np.hypot(fit.error_mm[rows], DENSER_ERROR * (denser[span] - walls.shift_mm))
+
+    for _ in deal_in_order([judge_piece] * _JUDGES, fit_pieces()):  # beside the fits of the next pieces
+        pass
     fit.states[(fit.states == FITTED) & (fit.error_mm > MOST_SHIFT_MM)] = BADLY_FITTED
     is_wall = np.isin(fit.states, (FITTED, BADLY_FITTED))
     is_far = is_wall & ~lie_near(points, shows_bone, near_mm(resident.volume) / _CELLS_NEAR, _CELLS_NEAR)

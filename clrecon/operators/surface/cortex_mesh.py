@@ -103,8 +103,17 @@ class CortexReport(Record):
 
 def doubt_lone_vertices(fit: CortexFit, triangles: NDArray[np.uint32], fans: Fans) -> None:
     """Call vertices that are no bone badly fitted, in place, where `_LONE_SHARE` of those around them are fitted."""
-    rows = np.flatnonzero(fit.states == NOT_BONE)
-    counts = fans.sums((fit.states == FITTED).astype(np.float32)[:, None], triangles, rows)[:, 0]
+    fitted, lone = fit.states == FITTED, fit.states == NOT_BONE
+    is_rim = np.empty(len(triangles), bool)
+
+    def find_rims(piece: slice) -> None:
+        corners = triangles[piece].T.astype(np.intp)
+        is_rim[piece] = np.logical_and(*(of.take(corners).any(axis=0) for of in (fitted, lone)))
+
+    in_threads(find_rims, len(triangles))
+    rows = find_used(triangles[is_rim], len(lone))
+    rows = rows[lone[rows]]
+    counts = fans.sums(fitted.astype(np.float32)[:, None], triangles, rows)[:, 0]
     fit.states[rows[counts >= 2.0 * _LONE_SHARE * (fans.begin[rows + 1] - fans.begin[rows])]] = BADLY_FITTED
 
 
