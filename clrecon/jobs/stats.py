@@ -93,8 +93,8 @@ def _measure_surfaces(
         surface: dict[str, Any] = {"kind": settings.surface, "iso_value_hu": level, "area_mm2": None, "ml": None}
         mesh = meshes.get(row.number) if row.max_hu is not None and row.max_hu >= level else None  # not filled alone
         if mesh is not None:
-            area, mm3 = measure_triangles(mesh.vertices, mesh.triangles)[:2]
-            surface |= {"area_mm2": area, "ml": mm3 / 1000.0}
+            sums = measure_triangles(mesh.vertices, mesh.triangles)
+            surface |= {"area_mm2": sums.area_mm2, "ml": sums.volume_mm3 / 1000.0}
         measured.append(row.changed(surface=surface | {"cortex": mesh and mesh.report.get("cortex")}))
     return measured
 

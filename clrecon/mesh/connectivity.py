@@ -52,6 +52,59 @@ class Edges:
         return is_border
 
 
+@dataclass(frozen=True)
+class Topology:
+    """What the indices of a mesh tell.
+
+    edges, boundary, nonmanifold, oriented: See `Edges`.
+    loops: Half-edges that start and end at one vertex.
+    split_vertices: Vertices whose faces form several fans.
+    labelled: The result of `label_components`.
+    opposite: See `opposite_half_edges`; None too where it was not looked for.
+    """
+
+    edges: int
+    boundary: int
+    nonmanifold: int
+    oriented: bool
+    loops: int
+    split_vertices: int
+    duplicate_faces: int
+    labelled: tuple[int, NDArray[np.int64]]
+    opposite: IntArray | None = None
+
+
+def find_topology(
+    triangles: NDArray[np.uint32],
+    vertex_count: int,
+    known: tuple[tuple[int, NDArray[np.int64]], IntArray] | None = None,
+) -> Topology:
+    """Find what the indices tell; where components and irregular vertices are `known`, from the triangles at these.
+
+    Around all other vertices each edge is in two triangles, run along in opposite directions, and no two triangles have
+    the same corners.
+    """
+    if known is None:
+        rows, is_irregular = triangles, np.ones(vertex_count, bool)
+    elif len(known[1]) == 0:
+        return Topology(triangles.size // 2, 0, 0, True, 0, 0, 0, known[0])
+    else:
+        is_irregular = np.zeros(vertex_count, bool)
+        is_irregular[known[1]] = True
+        a, b, c = (is_irregular.take(corner) for corner in triangles.T)
+        rows = triangles[a | b | c]
+    edges = find_edges(rows, vertex_count)
+    opposite = opposite_half_edges(rows, edges)
+    uses, loops = edges.uses[is_irregular[edges.ends].any(axis=0)], rows.size - len(edges.half_edges)
+    regular_edges = (triangles.size - loops - int(uses.sum())) // 2
+    split = find_split_vertices(rows, vertex_count, edges, opposite)
+    return Topology(
+        len(uses) + regular_edges, int(np.count_nonzero(uses == 1)), edges.nonmanifold, edges.oriented, loops,
+        int(np.count_nonzero(is_irregular[split])), count_duplicate_faces(rows, vertex_count, opposite),
+        known[0] if known else label_components(triangles, vertex_count, edges), None if known else opposite,
+    )  # fmt: skip
+
+
 def _index_type(size: int) -> type[np.integer]:
     return np.int32 if size < 2**31 else np.int64
 

@@ -68,7 +68,7 @@ class Mesh(BaseMesh, ShownAsHtml):
     @property
     def area(self) -> float:
         """Area in mm2."""
-        return measure_triangles(self.vertices, self.triangles)[0]
+        return measure_triangles(self.vertices, self.triangles).area_mm2
 
     @property
     def volume(self) -> float:
@@ -76,7 +76,7 @@ class Mesh(BaseMesh, ShownAsHtml):
 
         It means nothing where the mesh is open: see `quality`.
         """
-        return measure_triangles(self.vertices, self.triangles)[1]
+        return measure_triangles(self.vertices, self.triangles).volume_mm3
 
     def quality(self) -> MeshQuality:
         """Measure the mesh: closedness, size and faults."""

@@ -68,59 +68,66 @@ def measure_quality(vertices: NDArray[np.floating], triangles: NDArray[np.uint32
 
 
 def survey_surface(
-    vertices: NDArray[np.floating], triangles: NDArray[np.uint32]
-) -> tuple[MeshQuality, connectivity.IntArray | None]:
-    """Measure a surface; return also the half-edge opposite each, see `clrecon.mesh.connectivity`."""
+    vertices: NDArray[np.floating],
+    triangles: NDArray[np.uint32],
+    topology: connectivity.Topology | None = None,
+    *,
+    by_triangle: bool = False,
+) -> tuple[MeshQuality, connectivity.Topology, TriangleSums]:
+    """Measure a surface; return also what that rests on.
+
+    topology: Of these triangles, if it is known.
+    by_triangle: The sums have the arrays of all triangles.
+    """
     vertex_count, triangle_count = len(vertices), len(triangles)
     if triangle_count and int(triangles.max()) >= vertex_count:
         raise UsageError(f"a triangle refers to vertex {int(triangles.max())}, the mesh has {vertex_count} vertices")
 
-    edges = connectivity.find_edges(triangles, vertex_count)
-    opposite = connectivity.opposite_half_edges(triangles, edges)
-    split_vertices = len(connectivity.find_split_vertices(triangles, vertex_count, edges, opposite))
-    components, labels = connectivity.label_components(triangles, vertex_count, edges)
+    topology = topology or connectivity.find_topology(triangles, vertex_count)
+    components, labels = topology.labelled
     unused = int(np.count_nonzero(labels < 0))
-    loops = triangles.size - len(edges.half_edges)
-    euler_number = vertex_count - unused - edges.count + triangle_count
-    coincident, open_by_place = _count_by_place(vertices, triangles, labels >= 0, edges)
-    closed = triangle_count > 0 and edges.boundary == 0 and edges.nonmanifold == 0 and open_by_place == 0
-    manifold = triangle_count > 0 and edges.nonmanifold == 0 and edges.oriented and split_vertices == 0 and loops == 0
-    area, volume, zero_area, shortest = measure_triangles(vertices, triangles)
+    euler_number = vertex_count - unused - topology.edges + triangle_count
+    open_edges = topology.boundary + topology.nonmanifold
+    coincident, open_by_place = _count_by_place(vertices, triangles, labels >= 0, open_edges)
+    closed = triangle_count > 0 and open_edges == 0 and open_by_place == 0
+    is_split = topology.nonmanifold > 0 or topology.split_vertices > 0 or topology.loops > 0
+    manifold = triangle_count > 0 and topology.oriented and not is_split
+    sums = measure_triangles(vertices, triangles, by_triangle=by_triangle)
     quality = MeshQuality(
         vertices=vertex_count,
         triangles=triangle_count,
         closed=closed,
         manifold=manifold,
-        oriented=edges.oriented,
-        boundary_edges=edges.boundary,
-        nonmanifold_edges=edges.nonmanifold,
-        nonmanifold_vertices=split_vertices,
+        oriented=topology.oriented,
+        boundary_edges=topology.boundary,
+        nonmanifold_edges=topology.nonmanifold,
+        nonmanifold_vertices=topology.split_vertices,
         coincident_vertices=coincident,
         open_edges_by_place=open_by_place,
         components=components,
         euler_number=euler_number,
         genus=components - euler_number // 2 if closed and manifold else None,
-        zero_area_faces=zero_area,
-        duplicate_faces=connectivity.count_duplicate_faces(triangles, vertex_count, opposite),
+        zero_area_faces=sums.zero_area_faces,
+        duplicate_faces=topology.duplicate_faces,
         unused_vertices=unused,
-        shortest_edge_mm=shortest,
-        area_mm2=area,
-        volume_ml=volume / 1000.0,
-        outward=volume > 0.0,
+        shortest_edge_mm=sums.shortest_edge_mm,
+        area_mm2=sums.area_mm2,
+        volume_ml=sums.volume_mm3 / 1000.0,
+        outward=sums.volume_mm3 > 0.0,
         bounds_mm=[corner.tolist() for corner in find_bounds(vertices)] if vertex_count else None,
     )
-    return quality, opposite
+    return quality, topology, sums
 
 
 def _count_by_place(
-    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], used: NDArray[np.bool_], edges: connectivity.Edges
+    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], used: NDArray[np.bool_], open_edges: int
 ) -> tuple[int, int]:
     """Count used vertices that coincide with another, and edges that are not in two faces after these are joined."""
     coincident = find_coincident(vertices)
     coincident = coincident[used[coincident]]
     places, first, number = np.unique(vertices[coincident], axis=0, return_index=True, return_inverse=True)
     if len(places) == len(coincident):  # the vertices that they coincide with are not used
-        return 0, edges.boundary + edges.nonmanifold
+        return 0, open_edges
     joined = np.arange(len(vertices), dtype=np.uint32)
     joined[coincident] = coincident[first][number.reshape(-1)]
     faces = joined[triangles]
@@ -129,12 +136,28 @@ def _count_by_place(
     return len(coincident), by_place.boundary + by_place.nonmanifold
 
 
+@dataclass(frozen=True, eq=False)
+class TriangleSums:
+    """Measures of triangles; volumes have signs.
+
+    twice_areas, six_volumes: Of each triangle, mm2 and mm3, the latter over an origin that all have in common.  Empty
+        unless they were wanted.
+    """
+
+    area_mm2: float
+    volume_mm3: float
+    zero_area_faces: int
+    shortest_edge_mm: float | None
+    twice_areas: NDArray[np.float64]
+    six_volumes: NDArray[np.float64]
+
+
 def measure_triangles(
-    vertices: NDArray[np.floating], triangles: NDArray[np.uint32]
-) -> tuple[float, float, int, float | None]:
-    """Measure area in mm2, signed volume in mm3, number of triangles without area, shortest edge in mm."""
+    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], *, by_triangle: bool = False
+) -> TriangleSums:
     columns, origin = np.ascontiguousarray(vertices.T.astype(np.float64)), local_origin(vertices)
     pieces: dict[int, tuple[float, ...]] = {}
+    twice_areas, six_volumes = (np.empty(len(triangles) if by_triangle else 0) for _ in range(2))
 
     def measure_piece(piece: slice) -> None:
         corner, p, q = take_edges(columns, triangles[piece], origin)
@@ -142,14 +165,27 @@ def measure_triangles(
         squares = np.einsum("ij,ij->j", cross, cross)
         shortest = min(np.einsum("ij,ij->j", edge, edge).min() for edge in (p, q, q - p))
         volume = np.einsum("ij,ij->", corner, cross)
-        pieces[piece.start] = np.sqrt(squares).sum(), volume, int(np.count_nonzero(squares == 0.0)), shortest
+        lengths = np.sqrt(squares)
+        if by_triangle:
+            twice_areas[piece] = lengths
+            np.einsum("ij,ij->j", corner, cross, out=six_volumes[piece])
+        pieces[piece.start] = lengths.sum(), volume, int(np.count_nonzero(squares == 0.0)), shortest
 
     in_threads(measure_piece, len(triangles))
     if not pieces:
-        return 0.0, 0.0, 0, None
+        return TriangleSums(0.0, 0.0, 0, None, twice_areas, six_volumes)
     rows = np.array([pieces[start] for start in sorted(pieces)])
-    twice_area, six_volumes, zero_area, _ = rows.sum(axis=0).tolist()
-    return twice_area / 2.0, six_volumes / 6.0, int(zero_area), math.sqrt(rows[:, 3].min())
+    twice_area, six_volume, zero_area, _ = rows.sum(axis=0).tolist()
+    shortest = math.sqrt(rows[:, 3].min())
+    return TriangleSums(twice_area / 2.0, six_volume / 6.0, int(zero_area), shortest, twice_areas, six_volumes)
+
+
+def measure_component_ml(
+    triangles: NDArray[np.uint32], sums: TriangleSums, topology: connectivity.Topology
+) -> NDArray[np.float64]:
+    """Return the enclosed volume of each closed component, ml, without sign, from sums of each triangle."""
+    count, labels = topology.labelled
+    return np.abs(np.bincount(labels.take(triangles[:, 0]), sums.six_volumes, count)) / 6000.0
 
 
 def find_pieces(vertices: NDArray[np.floating], triangles: NDArray[np.uint32], most: int) -> Pieces:

@@ -67,6 +67,11 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
     },
     "clear_labels": {"labels": (("= UNUSED;", "= ~UNUSED;"),)},
     "hook_corners": {"labels": (("min(corner.x, min(corner.y, corner.z))", "max(corner.x, max(corner.y, corner.z))"),)},
+    "link_corners": {"corners": (("corner.y, first + 1)", "corner.y, first + 2)"),)},
+    "follow_fans": {
+        "mask": MARK,
+        "labels": (("label = min(label, min(ends.x, ends.y));", "label = max(label, max(ends.x, ends.y));"),),
+    },
     "jump_labels": {"labels": ((": follow_labels(", ": n - 1 - follow_labels("),)},
     "mark_mixed": {"mask": MARK},
     "mark_roots": {"mask": MARK},

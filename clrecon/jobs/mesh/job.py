@@ -14,9 +14,16 @@ from clrecon.exchange.formats import check_assembly, check_in_pieces, describe_r
 from clrecon.geometry import frame_from_lps
 from clrecon.jobs.mesh.bone import judge_surfaces, warn_of_walls
 from clrecon.jobs.mesh.labels import describe_label, judge_label_volumes, name_label_files
-from clrecon.jobs.mesh.make import MadeParts, first_names, label_parts, make_parts, warn_of_crumbs
+from clrecon.jobs.mesh.make import MadeParts, first_names, label_parts, make_parts
 from clrecon.jobs.mesh.purposes import describe_purposes
-from clrecon.jobs.mesh.refinement import judge_parts, place_on_cortex, refine_and_measure, warn_of_gates, warn_of_shift
+from clrecon.jobs.mesh.refinement import (
+    judge_parts,
+    place_on_cortex,
+    refine_and_measure,
+    warn_of_crumbs,
+    warn_of_gates,
+    warn_of_shift,
+)
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part, Surface, describe_level, plan_surfaces, warn_of_contrast
 from clrecon.jobs.outputs import check_kept, check_outputs, count_leftovers, name_outputs, refuse_files, refuse_numbered
@@ -302,7 +309,7 @@ def make_mesh(
         run.lap("select")
         gates = _refine_and_measure(run, result, is_measured)
         warnings = [
-            *warn_of_crumbs(parts, settings, result.device),
+            *warn_of_crumbs(parts, settings),
             *warn_of_shift(parts, settings),
             *describe_purposes(parts, settings, result.volume, result.device),
             *warn_of_gates(gates),

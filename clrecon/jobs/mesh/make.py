@@ -309,11 +309,6 @@ def drop_outside_air(volume: Volume, settings: MeshSettings, progress: Progress)
     return volume
 
 
-_CRUMB_ML = 0.1
-_CRUMB_SHARE = 0.01
-_MANY_COMPONENTS = 100
-"""A mesh of more components than this below this volume, or this share of all where it is small, gets a warning."""
-
 _SELECT_STEPS = 4
 """Steps of the selection from a surface, as progress counts them: pieces, components, bone, and what is kept."""
 
@@ -427,28 +422,6 @@ def label_parts(mesh: Mesh, device: Device, settings: MeshSettings) -> Labelled:
     except DeviceFailedError as error:  # the result is the same, it only takes longer
         mesh.report.setdefault("warnings", []).append(f"{error}: they were found without it")
         return label_on_host(mesh.triangles, mesh.vertex_count)
-
-
-def warn_of_crumbs(parts: Sequence[Part], settings: MeshSettings, device: Device) -> list[str]:
-    """Return a warning for each measured mesh of many small components, which names the option that drops them."""
-    from clrecon.mesh.refine.shifts import enclosed_mm3
-
-    warnings = []
-    for part in parts:
-        if part.quality is None or part.quality.components <= _MANY_COMPONENTS or settings.min_volume_ml is not None:
-            continue
-        mesh = part.mesh
-        labelled = label_parts(mesh, device, settings)
-        ml = np.abs(enclosed_mm3(mesh.vertices - local_origin(mesh.vertices), mesh.triangles, *labelled)) / 1000.0
-        crumb_ml = float(f"{min(_CRUMB_ML, _CRUMB_SHARE * float(ml.sum())):.1g}")
-        small = ml[ml < crumb_ml]
-        if len(small) > _MANY_COMPONENTS:
-            warnings.append(
-                f"{f'{part.name}: ' if part.name else ''}{len(small):,} of {len(ml):,} components enclose less than"
-                f" {format_ml(crumb_ml)} each, {format_ml(float(small.sum()))} together:"
-                f" {name_parameter('min_volume_ml', f'{crumb_ml:g}')} drops them"
-            )
-    return warnings
 
 
 def _advise_without_bone(settings: MeshSettings) -> str:

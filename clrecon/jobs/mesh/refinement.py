@@ -7,7 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from clrecon.errors import DeviceError, NoSurfaceError
+import numpy as np
+
+from clrecon.errors import DeviceError, DeviceFailedError, NoSurfaceError
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import VALUE_GATES, Part
 from clrecon.jobs.presets import HIGHEST_BONE_HU, LOWEST_BONE_HU
@@ -15,12 +17,16 @@ from clrecon.system.arguments import name_parameter
 from clrecon.system.pieces import side_by_side
 from clrecon.system.progress import Progress, Steps, ignore_progress
 from clrecon.system.records import failed_gates
+from clrecon.system.text import format_ml
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from clrecon.geometry import Volume
     from clrecon.geometry.iso_rule import IsoRule
     from clrecon.jobs.mesh.make import MadeParts
     from clrecon.mesh import Mesh
+    from clrecon.mesh.connectivity import Topology
     from clrecon.opencl import Device
     from clrecon.system.records import Gate
 
@@ -35,6 +41,16 @@ smoothing leaves is only known once it is measured.  The first is enough for mos
 """
 
 _JUDGED_AS_FAR = ("iso_distance_p95", "iso_distance_mean", "deviation_p95", "deviation_mean")
+
+
+_CRUMB_ML = 0.1
+_CRUMB_SHARE = 0.01
+_MANY_COMPONENTS = 100
+"""A mesh of more components than this below this volume, or this share of all where it is small, gets a warning."""
+
+
+_FEWEST_ON_DEVICE = 50_000
+"""Triangles of which a device finds the topology; of fewer the host finds it as soon."""
 
 
 def refine_surface(
@@ -114,6 +130,24 @@ def _may_be_bone(part: Part) -> bool:
     return math.isfinite(level) and LOWEST_BONE_HU <= level <= HIGHEST_BONE_HU
 
 
+def warn_of_crumbs(parts: Sequence[Part], settings: MeshSettings) -> list[str]:
+    """Return a warning for each measured mesh of many small components, which names the option that drops them."""
+    warnings = []
+    for part in parts:
+        ml = part.component_ml
+        if ml is None or settings.min_volume_ml is not None:
+            continue
+        crumb_ml = float(f"{min(_CRUMB_ML, _CRUMB_SHARE * float(ml.sum())):.1g}")
+        small = ml[ml < crumb_ml]
+        if len(small) > _MANY_COMPONENTS:
+            warnings.append(
+                f"{f'{part.name}: ' if part.name else ''}{len(small):,} of {len(ml):,} components enclose less than"
+                f" {format_ml(crumb_ml)} each, {format_ml(float(small.sum()))} together:"
+                f" {name_parameter('min_volume_ml', f'{crumb_ml:g}')} drops them"
+            )
+    return warnings
+
+
 def warn_of_shift(parts: Sequence[Part], settings: MeshSettings) -> list[str]:
     """Warn of closed meshes whose level, not given by the scan, lies too far outside of the bone for their volume."""
     if settings.half_way == "auto" or not settings.closed:
@@ -156,7 +190,8 @@ def _measure_size(part: Part) -> tuple[float, float]:
     from clrecon.mesh.quality import measure_triangles
 
     if part.quality is None:
-        return measure_triangles(part.mesh.vertices, part.mesh.triangles)[:2]
+        sums = measure_triangles(part.mesh.vertices, part.mesh.triangles)
+        return sums.area_mm2, sums.volume_mm3
     return part.quality.area_mm2, 1000.0 * (part.quality.volume_ml or 0.0)
 
 
@@ -204,43 +239,65 @@ def measure_parts(
     progress: Progress = ignore_progress,
 ) -> None:
     """Measure the `quality` of each part and its distances from the scan; with `strict` triangles that cut others."""
+    topologies = [_find_topology(part.mesh, device, settings) for part in parts]
     if settings.strict:
         steps = Steps(progress, "crossings", sum(part.mesh.triangle_count for part in parts))
         _, crossings = side_by_side(
-            partial(_measure_on_host, parts, volume, ignore_progress),
+            partial(_measure_on_host, parts, topologies, volume, ignore_progress),
             lambda: [_count_crossings(part.mesh, device, steps) for part in parts],
         )
         for part, count in zip(parts, crossings, strict=True):
             assert part.quality is not None
             part.quality = part.quality.changed(self_intersections=count)
     else:
-        _measure_on_host(parts, volume, progress)
+        _measure_on_host(parts, topologies, volume, progress)
 
 
-def _measure_on_host(parts: Sequence[Part], volume: Volume, progress: Progress) -> None:
+def _find_topology(mesh: Mesh, device: Device | None, settings: MeshSettings) -> Topology:
+    """Find it on the device or, for small meshes and where that fails, which is warned of, on the host."""
+    from clrecon.mesh.connectivity import find_topology
+
+    known = None
+    if device is not None and mesh.triangle_count >= _FEWEST_ON_DEVICE:
+        from clrecon.operators.primitives.union_find import label_fans
+
+        try:
+            known = label_fans(device.current, mesh.triangles, mesh.vertex_count, memory=settings.memory)
+        except DeviceFailedError as error:  # the result is the same, it only takes longer
+            mesh.report.setdefault("warnings", []).append(f"{error}: the mesh was measured without it")
+    return find_topology(mesh.triangles, mesh.vertex_count, known)
+
+
+def _measure_on_host(parts: Sequence[Part], topologies: Sequence[Topology], volume: Volume, progress: Progress) -> None:
+    from clrecon.mesh.quality import measure_component_ml, survey_surface
+
     steps = Steps(progress, "measure", len(parts))
+    twice_areas = []
+    for part, topology in zip(parts, topologies, strict=True):
+        mesh = part.mesh
+        part.quality, _, sums = survey_surface(mesh.vertices, mesh.triangles, topology, by_triangle=True)
+        if part.quality.components > _MANY_COMPONENTS:
+            part.component_ml = measure_component_ml(mesh.triangles, sums, topology)
+        twice_areas.append(sums.twice_areas)
+        steps.take()
+    _measure_distances(parts, twice_areas, volume)
 
-    def measure_qualities() -> None:
-        for part in parts:
-            part.quality = part.mesh.quality()
-            steps.take()
 
-    side_by_side(partial(_measure_distances, parts, volume), measure_qualities)
-
-
-def _measure_distances(parts: Sequence[Part], volume: Volume) -> None:
+def _measure_distances(parts: Sequence[Part], twice_areas: Sequence[NDArray[np.float64]], volume: Volume) -> None:
     """Measure how far parts lie from the scan; None where no level of HU places one."""
     from clrecon.mesh.compare.iso_distance import measure_iso_distances, rule_of_report
 
-    placed: dict[IsoRule, list[Part]] = {}
-    for part in parts:
+    placed: dict[IsoRule, list[tuple[Part, NDArray[np.float64]]]] = {}
+    for part, areas in zip(parts, twice_areas, strict=True):
         part.facts["iso_distance"] = None
         moved = (part.mesh.report.get("cortex") or {}).get("moved", False)
         rule = None if moved or part.surface.label is not None else rule_of_report(part.mesh.report)
         if rule is not None:
-            placed.setdefault(rule, []).append(part)
+            placed.setdefault(rule, []).append((part, areas))
     for rule, group in placed.items():
-        for part, gap in zip(group, measure_iso_distances([part.mesh for part in group], volume, rule), strict=True):
+        meshes, areas_of_meshes = [part.mesh for part, _ in group], [areas for _, areas in group]
+        gaps = measure_iso_distances(meshes, volume, rule, twice_areas=areas_of_meshes)
+        for (part, _), gap in zip(group, gaps, strict=True):
             part.facts["iso_distance"] = gap
 
 

@@ -15,6 +15,9 @@ from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import format_hu
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from clrecon.anatomy.iso_choice import IsoChoice
     from clrecon.geometry import Volume
     from clrecon.mesh import Mesh
@@ -61,6 +64,7 @@ class Part:
     facts: Further entries of its object in the report.
     pieces: Enclosed volumes of the components of its surface, as extracted and as kept, if the purpose needs them.
     bones: Counted if some of it does not look like bone.
+    component_ml: Enclosed volume of each component as written, without sign, where it was measured and has many.
     """
 
     surface: Surface
@@ -70,6 +74,7 @@ class Part:
     facts: dict[str, Any] = field(default_factory=dict)
     pieces: tuple[dict[str, float], dict[str, float]] | None = None
     bones: Bones | None = None
+    component_ml: NDArray[np.float64] | None = None
 
 
 def plan_surfaces(levels: Sequence[float | tuple[float, ...]], *, below: bool = False) -> list[Surface]:

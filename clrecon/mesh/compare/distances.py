@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.mesh.connectivity import Fans
 from clrecon.mesh.mesh import Mesh
+from clrecon.mesh.quality import measure_triangles
 from clrecon.mesh.triangle_tree import TriangleTree
-from clrecon.mesh.triangles import cross_product, cross_products, enclosed_ml
+from clrecon.mesh.triangles import cross_product, enclosed_ml
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.pieces import in_threads, local_origin
@@ -36,10 +37,7 @@ def sample_surface_points(
     vertices: NDArray[np.floating], triangles: NDArray[np.uint32], count: int = SAMPLES
 ) -> tuple[Points, NDArray[np.int64]]:
     """As `sample_surface`, with the row of the triangle of each point, shape (count,)."""
-    area = np.zeros(len(triangles))
-    for piece, _, cross in cross_products(vertices, triangles, np.zeros(3)):
-        area[piece] = np.sqrt(np.einsum("ij,ij->j", cross, cross))
-    up_to = np.cumsum(area)
+    up_to = np.cumsum(measure_triangles(vertices, triangles, by_triangle=True).twice_areas)
     if len(up_to) == 0 or up_to[-1] <= 0.0:
         raise NoSurfaceError("a surface without area has no points to measure from")
     number = np.arange(count, dtype=np.float64)

@@ -14,9 +14,9 @@ from clrecon.geometry import METAL_HU, Volume
 from clrecon.geometry.iso_rule import IsoRule, layer_normal_matrices
 from clrecon.mesh.compare.distances import DistanceSummary, summarise_distances
 from clrecon.mesh.mesh import Mesh
-from clrecon.mesh.triangles import cross_products
+from clrecon.mesh.quality import measure_triangles
 from clrecon.system.light_dataclass import dataclass
-from clrecon.system.pieces import chunks, local_origin
+from clrecon.system.pieces import chunks
 from clrecon.system.records import Record
 
 SAMPLES = 100_000
@@ -150,31 +150,45 @@ def _distances_to_level(volume: Volume, rule: IsoRule, level: float, points: Flo
     matrices = np.asarray(layer_normal_matrices(volume, rule.border))
     longest = 0.5 * smallest_voxel_mm(volume)
     distances = np.full(len(points), np.nan)
-    for piece in chunks(len(points), _PIECE):
-        here = points[piece].copy()
-        going = np.arange(len(here))
-        for _ in range(_STEPS):
-            # Beyond the border the field does not change: a step from there would begin at the border all the same.
-            ijk = np.add(*_split_cells(volume, rule, volume.lps_to_ijk(here[going])))
-            here[going] = volume.ijk_to_lps(ijk)
-            value, per_step = trilinear_field(volume, rule, ijk)
-            slices = np.clip(np.floor(ijk[:, 2]).astype(np.int64) + rule.border, 0, len(matrices) - 1)
-            gradient = np.einsum("nab,nb->na", matrices[slices], per_step)
-            square = np.einsum("na,na->n", gradient, gradient)
-            uphill = square > 0.0
-            going, value = going[uphill], value[uphill]
-            gradient, square = gradient[uphill], square[uphill]
-            step = ((level - value) / square)[:, None] * gradient
-            length = np.linalg.norm(step, axis=1)
-            step *= np.minimum(1.0, longest / np.maximum(length, longest))[:, None]
-            here[going] += step
-            there = length <= _ON_THE_SURFACE
-            reached = going[there]
-            distances[piece][reached] = np.linalg.norm(here[reached] - points[piece][reached], axis=1)
-            going = going[~there]
-            if len(going) == 0:
-                break
+    here = points.copy()
+
+    def take_step(going: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Move points towards the surface; return those that have not reached it."""
+        # Beyond the border the field does not change: a step from there would begin at the border all the same.
+        ijk = np.add(*_split_cells(volume, rule, volume.lps_to_ijk(here.take(going, axis=0))))
+        position = volume.ijk_to_lps(ijk)
+        value, per_step = trilinear_field(volume, rule, ijk)
+        slices = np.clip(np.floor(ijk[:, 2]).astype(np.int64) + rule.border, 0, len(matrices) - 1)
+        gradient = np.einsum("nab,nb->na", matrices.take(slices, axis=0), per_step)
+        square = np.einsum("na,na->n", gradient, gradient)
+        uphill = square > 0.0
+        here[going] = position
+        going = going[uphill]
+        position, value = position[uphill], value[uphill]
+        gradient, square = gradient[uphill], square[uphill]
+        step = ((level - value) / square)[:, None] * gradient
+        length = _lengths(step)
+        step *= np.minimum(1.0, longest / np.maximum(length, longest))[:, None]
+        position += step
+        here[going] = position
+        there = length <= _ON_THE_SURFACE
+        reached = going[there]
+        distances[reached] = _lengths(position[there] - points.take(reached, axis=0))
+        return going[~there]
+
+    going = np.arange(len(points))
+    for _ in range(_STEPS):
+        if len(going) == 0:
+            break
+        going = np.concatenate([take_step(going[piece]) for piece in chunks(len(going), _PIECE)])
     return distances
+
+
+def _lengths(vectors: Float64Array) -> Float64Array:
+    """Return the lengths of vectors, (n, 3), as `numpy.linalg.norm` does, which takes several times as long."""
+    x, y, z = vectors.T
+    lengths: Float64Array = np.sqrt(x * x + y * y + z * z)
+    return lengths
 
 
 def _distances_along_lines(volume: Volume, rule: IsoRule, level: float, points: Float64Array) -> Float64Array:
@@ -237,7 +251,11 @@ class IsoDistance(Record):
 
 
 def measure_iso_distances(
-    meshes: Sequence[Mesh], volume: Volume, rule: IsoRule, samples: int = SAMPLES
+    meshes: Sequence[Mesh],
+    volume: Volume,
+    rule: IsoRule,
+    samples: int = SAMPLES,
+    twice_areas: Sequence[Float64Array] | None = None,
 ) -> list[IsoDistance]:
     """Measure how far vertices and centres of triangles lie from the iso surface that meshes were made from.
 
@@ -246,11 +264,13 @@ def measure_iso_distances(
     together: a call costs as much for ten points as for a thousand.
 
     samples: Most vertices and triangles of a mesh that are measured; of more, every n-th.
+    twice_areas: Of the triangles of each mesh, mm2, if they are known.
     """
     result: list[IsoDistance] = []
     waiting: list[_Points] = []
-    for number, mesh in enumerate(meshes, start=1):
-        waiting.append(_Points.of(mesh, samples))
+    known = twice_areas or [_measure_twice_areas(mesh) for mesh in meshes]
+    for number, (mesh, areas) in enumerate(zip(meshes, known, strict=True), start=1):
+        waiting.append(_Points.of(mesh, samples, areas))
         if number == len(meshes) or sum(len(each.places) for each in waiting) >= samples:
             places = np.concatenate([each.places for each in waiting])
             ends = np.cumsum([len(each.places) for each in waiting])[:-1]
@@ -259,6 +279,10 @@ def measure_iso_distances(
             result += map(partial(_sum_up, smallest_voxel_mm(volume)), waiting, distances, near_metal)
             waiting.clear()
     return result
+
+
+def _measure_twice_areas(mesh: Mesh) -> Float64Array:
+    return measure_triangles(mesh.vertices, mesh.triangles, by_triangle=True).twice_areas
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,20 +294,22 @@ class _Points:
     vertex_count: int
 
     @classmethod
-    def of(cls, mesh: Mesh, most: int) -> _Points:
+    def of(cls, mesh: Mesh, most: int, twice: Float64Array) -> _Points:
         """Take every n-th, at most so many of both; in a mesh without area all stand for the same."""
-        twice = np.ones(mesh.triangle_count)
-        for piece, _, cross in cross_products(mesh.vertices, mesh.triangles, local_origin(mesh.vertices)):
-            twice[piece] = np.sqrt(np.einsum("ij,ij->j", cross, cross))
         of_triangles = 0.5 * twice if twice.any() else np.ones(len(twice))
-        at_corners = np.repeat(of_triangles * _AT_A_CORNER, 3)
-        of_vertices = np.bincount(mesh.triangles.reshape(-1), at_corners, minlength=mesh.vertex_count)
         by_vertices, by_triangles = (-(-count // most) or 1 for count in (mesh.vertex_count, mesh.triangle_count))
-        centres = mesh.vertices[mesh.triangles[::by_triangles]].mean(axis=1, dtype=np.float64)
-        both = np.concatenate([mesh.vertices[::by_vertices].astype(np.float64), centres])
-        at_centres = (1.0 - 3.0 * _AT_A_CORNER) * of_triangles
-        areas = np.concatenate([by_vertices * of_vertices[::by_vertices], by_triangles * at_centres[::by_triangles]])
-        return cls(both, areas, len(both) - len(centres))
+        is_taken = np.zeros(mesh.vertex_count, bool)
+        is_taken[::by_vertices] = True
+        flat = mesh.triangles.reshape(-1)
+        corners = np.flatnonzero(is_taken.take(flat))
+        places = mesh.vertices[::by_vertices].astype(np.float64)
+        of_corners = of_triangles.take(corners // 3) * _AT_A_CORNER
+        of_vertices = np.bincount(flat.take(corners) // by_vertices, of_corners, len(places))
+        a, b, c = (mesh.vertices.take(corner, axis=0).astype(np.float64) for corner in mesh.triangles[::by_triangles].T)
+        both = np.concatenate([places, (a + b + c) / 3.0])
+        at_centres = (1.0 - 3.0 * _AT_A_CORNER) * of_triangles[::by_triangles]
+        areas = np.concatenate([by_vertices * of_vertices, by_triangles * at_centres])
+        return cls(both, areas, len(places))
 
 
 def _sum_up(voxel: float, points: _Points, distances: Float64Array, near_metal: NDArray[np.bool_]) -> IsoDistance:
@@ -292,28 +318,34 @@ def _sum_up(voxel: float, points: _Points, distances: Float64Array, near_metal: 
     share, away = float(areas[near_metal].sum() / (areas.sum() or 1.0)), None
     if 0.0 < share <= 0.5:
         clear = np.where(near_metal, np.nan, distances)
-        known = (_summarise(clear[part], areas[part], voxel) for part in (vertices, slice(None)))
+        known = (_in_units(_summarise(clear[part], areas[part]), voxel) for part in (vertices, slice(None)))
         away = min(filter(None, known), key=lambda one: one.mean, default=None)
+    of_vertices = _summarise(distances[vertices], areas[vertices])
+    of_centres = _summarise(distances[centres], areas[centres])
     return IsoDistance(
         voxel,
         {"vertices": count, "centres": len(distances) - count},
         int(np.count_nonzero(~np.isfinite(distances))),
-        vertices_mm=_summarise(distances[vertices], areas[vertices]),
-        vertices_voxel=_summarise(distances[vertices], areas[vertices], voxel),
-        centres_mm=_summarise(distances[centres], areas[centres]),
-        centres_voxel=_summarise(distances[centres], areas[centres], voxel),
-        surface_voxel=_summarise(distances, areas, voxel),
+        vertices_mm=of_vertices,
+        vertices_voxel=_in_units(of_vertices, voxel),
+        centres_mm=of_centres,
+        centres_voxel=_in_units(of_centres, voxel),
+        surface_voxel=_in_units(_summarise(distances, areas), voxel),
         near_metal_share=share,
         away_from_metal_voxel=away,
     )
 
 
-def _summarise(distances: Float64Array, areas: Float64Array, unit_mm: float = 1.0) -> DistanceSummary | None:
+def _in_units(summary: DistanceSummary | None, unit_mm: float) -> DistanceSummary | None:
+    return summary and DistanceSummary(*(value / unit_mm for value in summary.values()))
+
+
+def _summarise(distances: Float64Array, areas: Float64Array) -> DistanceSummary | None:
     """Sum up the finite distances by the area that each stands for, None without any."""
     known = np.isfinite(distances) & (areas > 0.0)
     if not known.any():
         return None
-    return DistanceSummary(*(value / unit_mm for value in summarise_distances(distances[known], areas[known]).values()))
+    return summarise_distances(distances[known], areas[known])
 
 
 def _find_near_metal(volume: Volume, rule: IsoRule, points: Float64Array) -> NDArray[np.bool_]:

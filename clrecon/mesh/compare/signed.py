@@ -21,9 +21,9 @@ from clrecon.mesh.compare.distances import (
     sample_surface,
     summarise_distances,
 )
-from clrecon.mesh.connectivity import IntArray, find_edges, opposite_half_edges
+from clrecon.mesh.connectivity import IntArray, Topology, find_edges, opposite_half_edges
 from clrecon.mesh.mesh import Mesh
-from clrecon.mesh.quality import MeshQuality, survey_surface
+from clrecon.mesh.quality import MeshQuality, TriangleSums, survey_surface
 from clrecon.mesh.triangle_tree import TriangleTree
 from clrecon.mesh.triangles import cross_product, vertex_normals
 from clrecon.system.arguments import explains_arguments
@@ -122,17 +122,17 @@ class Ruler:
     warnings: list[str]
 
     @classmethod
-    def of(cls, mesh: Mesh, name: str, survey: tuple[MeshQuality, IntArray | None] | None = None) -> Ruler:
+    def of(cls, mesh: Mesh, name: str, survey: tuple[MeshQuality, Topology, TriangleSums] | None = None) -> Ruler:
         """Make the ruler of a mesh that warnings call `name`; `survey`: that of `survey_surface`, if it is known."""
         mesh.check()
         if not mesh.triangle_count:
             raise NoSurfaceError(f"{name} has no triangles: there is nothing to measure from")
-        quality, opposite = survey or survey_surface(mesh.vertices, mesh.triangles)
+        quality, topology, _ = survey or survey_surface(mesh.vertices, mesh.triangles)
         why = why_unsigned(quality, name)
         if why is not None:
             return cls(SurfaceDistance(mesh.vertices, mesh.triangles), False, [why])
         inverted = f"{name} is turned inside out: the sign of distances from it is turned back"
-        signed = SignedDistance(mesh.vertices, mesh.triangles, outward=quality.outward, opposite=opposite)
+        signed = SignedDistance(mesh.vertices, mesh.triangles, outward=quality.outward, opposite=topology.opposite)
         return cls(signed, True, [] if quality.outward else [inverted])
 
     def measure(

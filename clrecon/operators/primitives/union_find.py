@@ -1,4 +1,6 @@
-"""Components of a triangle mesh, or of nodes joined in pairs: the host side of cl/primitives/union_find.cl."""
+"""Components of a triangle mesh, or of nodes joined in pairs, and fans around the vertices of a mesh: the host side of
+cl/primitives/union_find.cl and fans.cl.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +11,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clrecon import opencl as ocl
-from clrecon.errors import DeviceError, UsageError
+from clrecon.errors import DeviceError, DeviceMemoryError, UsageError
 from clrecon.opencl import Device, Program
 from clrecon.operators.primitives.scan import LARGEST_SCAN, Compacted, compact, exclusive_scan, prepare_compact
 
 _LARGEST_MESH = 2**32 - 1
 """Most triangles, so that 32 bits can count them."""
+
+_MOST_CORNERS = 2**32 - 1
+"""Most corners, which have numbers of 32 bits, and one that is none."""
 
 _MOST_PASSES = 1000
 """Limit of passes, far above the need of 2^31 vertices: 62 rounds of at most 11 passes each."""
@@ -41,9 +46,28 @@ def label_components(
     if len(faces) == 0:
         return 0, np.full(vertex_count, -1, dtype=np.int64)
     search = _Search(device, faces, vertex_count, memory)
-    count, numbers_d = search.number(*search.find_roots(), vertex_count)
-    numbers = ocl.download(device, np.empty(vertex_count, dtype=np.int32), numbers_d)
-    return count, numbers.astype(np.int64)
+    search.hook_corners()
+    return search.label()
+
+
+def label_fans(
+    device: Device, triangles: NDArray[np.uint32], vertex_count: int, *, memory: int | None = None
+) -> tuple[tuple[int, NDArray[np.int64]], NDArray[np.uint32]]:
+    """Number the components of at least one triangle as `label_components`, and look at the fan of each vertex.
+
+    Returns:
+    labelled: The result of `label_components`.
+    irregular: ndarray, shape (k,), uint32. Used vertices whose triangles are not one closed fan, rising; and those of
+        more than 16 triangles, or of two.
+    """
+    _check_mesh(triangles, vertex_count)
+    if triangles.size > _MOST_CORNERS:
+        raise DeviceMemoryError(
+            f"fans are found in up to {_MOST_CORNERS // 3:,} triangles, the mesh has {len(triangles):,}"
+        )
+    search = _Search(device, triangles, vertex_count, memory, links=triangles.nbytes)
+    irregular = search.hook_along_fans()
+    return search.label(), ocl.download(device, np.empty(irregular.count, np.uint32), irregular.positions_d)
 
 
 def join_parts(device: Device, labels_d: Any, spare_d: Any, n: int, links_d: Any, links: int) -> tuple[int, Any]:
@@ -183,11 +207,15 @@ class _Rounds:
 
 
 class _Search(_Rounds):
-    def __init__(self, device: Device, triangles: NDArray[np.uint32], vertex_count: int, memory: int | None):
+    def __init__(
+        self, device: Device, triangles: NDArray[np.uint32], vertex_count: int, memory: int | None, links: int = 0
+    ):
         self._limits = ocl.memory_limits(device, memory)
         self._faces, self._vertices = len(triangles), vertex_count
         labels = 4 * vertex_count
         self._buffers = {"triangles": triangles.nbytes, "labels": labels, "labels of the round before": labels}
+        if links:
+            self._check_budget({"links of corners": links})
         self._check_budget({"mixed triangles": 4 * self._faces, "roots of the first round": labels})
         self._check_budget({"component offsets": labels, "component numbers": labels})
         prepare_components(device)
@@ -197,10 +225,36 @@ class _Search(_Rounds):
     def _check_budget(self, more: dict[str, int]) -> None:
         ocl.require_room(self._limits, {**self._buffers, **more}, "the components of the mesh cannot be found")
 
-    def find_roots(self) -> tuple[Any, Any]:
-        """Run all rounds; return labels whose labels are all roots, and a free buffer, both (n,) uint32."""
-        self.run("clear_labels", self._vertices, labels=self._other_d, flags=self._flags_d, n=self._vertices)
+    def hook_corners(self) -> None:
+        """Run the first round: each vertex gets the smallest vertex in one triangle with it as label."""
+        self._clear(self._other_d)
         self.run("hook_corners", self._faces, triangles=self._faces_d, labels=self._other_d, m=self._faces)
+
+    def hook_along_fans(self) -> Compacted:
+        """Do the same from the fans of the vertices; return those that are irregular."""
+        run = ocl.launcher(self._device, ocl.load_program(self._device, "primitives/fans.cl"))
+        heads_d, links_d = self._labels_d, ocl.allocate(self._device, 12 * self._faces)
+        self._clear(heads_d)
+        run("link_corners", self._faces, triangles=self._faces_d, heads=heads_d, links=links_d, m=self._faces)
+        words = -(-self._vertices // 32)
+        mask_d = ocl.allocate(self._device, 4 * words)
+        run(
+            "follow_fans", words, triangles=self._faces_d, heads=heads_d, links=links_d, labels=self._other_d,
+            mask=mask_d, n=self._vertices,
+        )  # fmt: skip
+        return compact(self._device, mask_d, words)
+
+    def _clear(self, labels_d: Any) -> None:
+        self.run("clear_labels", self._vertices, labels=labels_d, flags=self._flags_d, n=self._vertices)
+
+    def label(self) -> tuple[int, NDArray[np.int64]]:
+        """Run all rounds after the first; return the result of `label_components`."""
+        count, numbers_d = self.number(*self._find_roots(), self._vertices)
+        numbers = ocl.download(self._device, np.empty(self._vertices, dtype=np.int32), numbers_d)
+        return count, numbers.astype(np.int64)
+
+    def _find_roots(self) -> tuple[Any, Any]:
+        """Return labels whose labels are all roots, and a free buffer, both (n,) uint32."""
         self.jump("jump_labels", self._vertices, n=self._vertices)
         labels_d, spare_d = self._labels_d, self._other_d
         mixed = self.list_marked("mark_mixed", self._faces, triangles=self._faces_d, labels=labels_d, m=self._faces)

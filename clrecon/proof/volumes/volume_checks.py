@@ -14,7 +14,7 @@ from clrecon.operators.filters.means import MeansSettings, run_means
 from clrecon.operators.filters.settings import BilateralSettings
 from clrecon.operators.masks.mask import Mask
 from clrecon.operators.primitives.scan import compact, exclusive_scan, radix_sort
-from clrecon.operators.primitives.union_find import label_components
+from clrecon.operators.primitives.union_find import label_components, label_fans
 from clrecon.operators.reformat.sheets import sample_sheet
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.tables import compare_bricks, measure_bricks
@@ -90,6 +90,35 @@ def _require_components(
     require_equal(numbers, labels, f"components of {len(mesh):,} triangles")
 
 
+def _check_fans(device: Device) -> str:
+    """Compare fans of random triangles, and of a torus in random order that has gaps and triangles turned round."""
+    nj, ni = 130, 140
+    j, i = np.indices((nj, ni)).reshape(2, -1)
+    here, right = j * ni + i, j * ni + (i + 1) % ni
+    above, beyond = (j + 1) % nj * ni + i, (j + 1) % nj * ni + (i + 1) % ni
+    torus = np.concatenate([np.stack([here, right, beyond], 1), np.stack([here, beyond, above], 1)])
+    rng = np.random.default_rng(5)
+    torus = rng.permutation(nj * ni)[torus][rng.permutation(len(torus))[:-9]].astype(np.uint32)
+    torus[::999] = torus[::999, ::-1]
+    cones = [_make_cones(rim, nj * ni + 40 * rim) for rim in (2, 3, 16, 17)]
+    vertices = nj * ni + 40 * 18
+    for mesh in (np.concatenate([torus, *cones]), random_integers((6_000, 3), "uint32", vertices)):
+        labelled, irregular = label_fans(device, mesh, vertices)
+        count, labels = twin.label_components(mesh, vertices)
+        require_equal(labelled[1], labels, f"components of {len(mesh):,} triangles")
+        require_equal(labelled[0], count, "number of components")
+        require_equal(irregular, np.array(twin.find_irregular(mesh, vertices)), "irregular vertices")
+    return "2 meshes of 6,000 and 36,467 triangles equal"
+
+
+def _make_cones(rim: int, first: int) -> NDArray[np.uint32]:
+    """Return a closed surface of two cones, whose tips are in `rim` triangles each."""
+    around = np.arange(rim)
+    ahead = (around + 1) % rim
+    tips = np.stack([np.full(rim, rim), around, ahead], 1), np.stack([np.full(rim, rim + 1), ahead, around], 1)
+    return (first + np.concatenate(tips)).astype(np.uint32)
+
+
 PRIMITIVE_CHECKS = (
     Check("exclusive_scan", ("sum_blocks", "scan_block_sums", "scan_blocks"), _check_scan),
     Check("compact", ("count_set_bits", "list_set_bits"), _check_compaction),
@@ -102,6 +131,7 @@ PRIMITIVE_CHECKS = (
         ),
         _check_components,
     ),
+    Check("label_fans", ("link_corners", "follow_fans"), _check_fans),
 )  # fmt: skip
 
 

@@ -51,6 +51,27 @@ def label_components(triangles: NDArray[np.uint32], vertex_count: int) -> tuple[
     return int(np.count_nonzero(is_root)), np.where(used, number[roots], -1).astype(np.int64)
 
 
+def find_irregular(triangles: NDArray[np.uint32], vertex_count: int, longest: int = 16) -> list[int]:
+    """Return the used vertices whose triangles are not one closed fan of 3 to `longest`, one vertex at a time."""
+    corners: list[list[tuple[int, int]]] = [[] for _ in range(vertex_count)]
+    for a, b, c in triangles.tolist():
+        for before, vertex, after in ((c, a, b), (a, b, c), (b, c, a)):
+            corners[vertex].append((before, after))
+    irregular = []
+    for vertex, fan in enumerate(corners):
+        if not fan:
+            continue
+        after_of = dict(fan)
+        is_once = len(fan) == len(after_of) == len(set(after_of.values()))
+        turned = fan[:1]
+        while len(turned) <= len(fan) and turned[-1][1] in after_of and turned[-1][1] != fan[0][0]:
+            turned.append((turned[-1][1], after_of[turned[-1][1]]))
+        is_closed = is_once and len(turned) == len(fan) and turned[-1][1] == fan[0][0]
+        if not (is_closed and 2 < len(fan) <= longest):
+            irregular.append(vertex)
+    return irregular
+
+
 def measure_bricks(voxels: NDArray[Any], brick: int = 8) -> NDArray[Any]:
     """Return the lowest and highest value of each brick, (bk, bj, bi, 2)."""
     shape = [-(-n // brick) for n in voxels.shape]
