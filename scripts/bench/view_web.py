@@ -199,6 +199,11 @@ def measure_page(job: Job) -> dict[str, Any]:
     }
 
 
+def compiling_environment() -> dict[str, str]:
+    """This environment, without the variable that lets modules be compiled anew in each process."""
+    return {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+
+
 def cpu_seconds(pid: int) -> float:
     """Processor seconds of a process so far."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
@@ -221,10 +226,15 @@ class _Served:
 
 @contextmanager
 def _served(path: Path, job: Job, *options: str) -> Iterator[_Served]:
-    """Start a server as in a terminal, which is given back once its address is known."""
+    """Start a server as in a terminal, which is given back once its address is known.
+
+    Its modules are compiled once, as those of an installed package are.
+    """
     own, terminal = pty.openpty()
     command = [sys.executable, "-m", "clrecon", "view", str(path), "--no-open", "--device", str(job.device.index)]
-    process = subprocess.Popen([*command, *options], stdout=subprocess.PIPE, stderr=terminal, text=True)
+    process = subprocess.Popen(
+        [*command, *options], stdout=subprocess.PIPE, stderr=terminal, text=True, env=compiling_environment()
+    )
     os.close(terminal)
     served = _Served(process)
 
