@@ -126,7 +126,7 @@ def test_view_of_a_scan_begins_with_bone_without_the_table_and_says_what_was_tak
         facts = session.do({"do": "undo"})
 
         assert (session.model.state.mode, session.model.state.table) == ("bone", False)
-        assert "without the table" in facts["said"]
+        assert "table and blankets taken away" in facts["said"]
         assert facts["undone"] is None  # the table and the mode of the start are no step
 
 

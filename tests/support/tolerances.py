@@ -238,6 +238,7 @@ CLI_SPHERE_VOLUME_SHARE = 0.02  # sphere of 9 mm in voxels of 0.8 x 1.1 x 1.5 mm
 CLI_SPHERE_RADIUS_MM = 0.3  # sagitta of chords of 1.8 mm and the bent ramp; measured -0.26
 
 # --- views in a browser ---
+JPEG_GREYS = 2  # of 256; what a flat grey changes by in a picture for the browser
 VIEW_CHANGED_SHARE = 0.01  # of pixels; measured 0.04 where a ball of 5 mm is hidden, 0.12 where the view is turned
 VIEW_REDRAWN_SHARE = 0.002  # of pixels of the same view, drawn and compressed again; measured 0
 VIEW_LEVEL_HU = 0.5  # ends of a window are whole HU

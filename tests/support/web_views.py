@@ -29,7 +29,10 @@ PATIENCE = 120.0
 
 
 class FakePainter:
-    """Pictures of one grey, which is the iso value; `drawn` has the view and the sharpness of each."""
+    """Pictures of one grey, which is the iso value; `drawn` has the view and the sharpness of each.
+
+    opacity: Of all pixels, 0 to 255.
+    """
 
     device = SimpleNamespace(label="no device", memory_bytes=1 << 40)
     knows_table = True
@@ -38,6 +41,7 @@ class FakePainter:
         self.drawn: list[tuple[str, bool]] = []
         self.fault: Exception | None = None
         self.is_fitted, self.has_bone = False, True
+        self.opacity = 255
 
     def _paint(self, state: Any, size: Any, view: str, sharp: bool) -> Rendering:
         self.drawn.append((view, sharp))
@@ -45,7 +49,7 @@ class FakePainter:
             fault, self.fault = self.fault, None
             raise fault
         width, height = size
-        image = np.full((height, width, 4), 255, np.uint8)
+        image = np.full((height, width, 4), self.opacity, np.uint8)
         image[..., :3] = round(state.iso_value) % 256
         empty = np.full((height, width), np.nan, np.float32)
         return Rendering(image, empty, empty, state.camera, None, view, {"ms": 1.0, "sharp": sharp, "warnings": []})
@@ -127,6 +131,7 @@ class Client:
     """A browser that keeps what it was told.
 
     facts: The latest.
+    told: Names of the facts in each message.
     fixed: What does not change while it is connected.
     shows: True: it says that it has shown each picture.
     """
@@ -134,6 +139,7 @@ class Client:
     def __init__(self, socket: Any) -> None:
         self.socket = socket
         self.facts: dict[str, Any] = {}
+        self.told: list[set[str]] = []
         self.fixed: dict[str, Any] = {}
         self.notes: list[dict[str, Any]] = []
         self.pictures: list[tuple[dict[str, Any], Image.Image]] = []
@@ -172,7 +178,8 @@ class Client:
                     await self.tell("shown", number=head["number"])
             else:
                 told = json.loads(message.data)
-                self.facts = told.pop("facts", self.facts)
+                self.told.append(set(told.get("facts", ())))
+                self.facts |= told.pop("facts", {})
                 self.fixed = told.pop("fixed", self.fixed)
                 self.notes += [told] if told else []
             self._news.set()

@@ -462,7 +462,7 @@ class ViewModel(ChangingView):
                 for each in self.objects
             ],
             "bounds": [[round(float(value), 3) for value in corner] for corner in self._span(self.objects)],
-            "modes": [{"name": each.name, "words": each.words} for each in self.modes.values()],
+            "modes": [{"name": each.name, "words": each.words, "dark": each.is_dark} for each in self.modes.values()],
             "mode": state.mode,
             "iso": {"hu": state.iso_value, "low": self.iso_range[0], "high": self.iso_range[1]} if self.scans else None,
             "window": list(state.window),

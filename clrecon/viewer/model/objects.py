@@ -46,6 +46,11 @@ class ViewMode:
     joins: bool = True
     window: tuple[float, float] | None = None
 
+    @property
+    def is_dark(self) -> bool:
+        """True where black is behind the picture on light pages too, on which translucent tissue looks washed out."""
+        return self.kind in ("volume", "projection", "slices")
+
 
 @cache
 def find_modes() -> dict[str, ViewMode]:

@@ -200,7 +200,7 @@ def draw_thumbnail(volume: Volume) -> str:
 def to_address(image: Any) -> str:
     """Return a picture of Pillow as an address with its data."""
     stream = io.BytesIO()
-    image.save(stream, "JPEG", quality=80)
+    image.save(stream, "JPEG", quality=75, optimize=True)
     return "data:image/jpeg;base64," + b64encode(stream.getvalue()).decode("ascii")
 
 

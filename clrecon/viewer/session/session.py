@@ -142,12 +142,10 @@ class ViewSession(Closing):
             with self._lock:
                 now, share = self.model.state if moving else state, self._share
             picture = self.painter.picture(now, (width, height), sharp=not moving, share=share, cancelled=job.cancelled)
-            if moving:
-                took = max(1.0, picture.report["ms"])
-                share = picture.size[0] / width * math.sqrt(_MOVING_MS / took)
-                with self._lock:
-                    self._share = min(1.0, max(LEAST_SHARE, share))
             with self._lock:
+                if moving:
+                    share = picture.size[0] / width * math.sqrt(_MOVING_MS / max(1.0, picture.report["ms"]))
+                    self._share = min(1.0, max(LEAST_SHARE, share))
                 self._timing = {
                     "ms": round(picture.report["ms"], 1),
                     "size": list(picture.size),
@@ -322,12 +320,10 @@ class ViewSession(Closing):
 
     def _say_table(self) -> str:
         """Return what was taken away with the tables, and the way back."""
-        shares = [
-            f"{100.0 * facts['removed_share']:.3g} % of the voxels are air now, {facts['dense_voxels_removed']:,}"
-            " of them dense"
-            for facts in self.painter.remove_table().values()
-        ]
-        return f"without the table: {'; '.join(shares)}: look whether the body is whole (b: table on or off)"
+        facts = self.painter.remove_table()
+        removed = [(facts[scan.number]["dense_voxels_removed"], scan.volume.spacing) for scan in self.model.scans]
+        ml = sum(voxels * math.prod(spacing) / 1000.0 for voxels, spacing in removed)
+        return f"{format_volume(ml)} of table and blankets taken away: look whether the body is whole (b: show them)"
 
     def toggle_table(self) -> None:
         self.set_table(not self.model.state.table)

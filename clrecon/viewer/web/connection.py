@@ -1,8 +1,8 @@
 """One browser: commands go to its session; of pictures one at most is under way, and one waits.
 
-Small pictures come while something moves, sharp ones at rest, the views by turns.  A message is a line of facts as
-JSON, behind its length (4 bytes, lowest first), and a JPEG.  JPEG has no opacity: the picture lies over the page's
-ground.
+Small pictures come while something moves, sharp ones at rest, the views by turns.  Of the facts those are sent that
+changed.  The message of a picture is a line of facts as JSON, behind its length (4 bytes, lowest first), and a JPEG.
+JPEG has no opacity: the picture lies over the page's ground.
 """
 
 from __future__ import annotations
@@ -116,9 +116,8 @@ def encode_picture(picture: Rendering, ground: tuple[int, int, int], sharp: bool
     from PIL import Image
 
     stream = io.BytesIO()
-    Image.fromarray(_lay_over(picture.image, ground)).save(
-        stream, "JPEG", quality=_SHARP_QUALITY if sharp else _MOVING_QUALITY, subsampling=0 if sharp else 2
-    )
+    quality = {"quality": _SHARP_QUALITY, "subsampling": 0} if sharp else {"quality": _MOVING_QUALITY, "subsampling": 2}
+    Image.fromarray(_lay_over(picture.image, ground)).save(stream, "JPEG", optimize=sharp, **quality)
     width, height = picture.size
     head_facts = {**facts, "sharp": sharp, "size": [width, height], "camera": facts_of_camera(picture.camera)}
     head = json.dumps(head_facts, separators=(",", ":"), allow_nan=False).encode()
@@ -198,9 +197,6 @@ _MOST_WAITING = 256
 _SAID_ONCE = ("pick", "probe", "measure", "undone")
 """What the answer to a command holds beside the facts."""
 
-_NOT_FOR_BROWSERS = frozenset({"save"})
-"""Commands with a path on this computer: a browser gets a file as a download."""
-
 
 def ignore_line(line: str) -> None:
     """Drop a line that is said."""
@@ -243,7 +239,7 @@ class Connection:
         self._ready: bytes | None = None
         self._under_way = False
         self._notes: list[dict[str, Any]] = []
-        self._told = ""
+        self._told: dict[str, str] = {}
         self._resting: asyncio.TimerHandle | None = None
         self._wake = asyncio.Event()
         self._waiting: asyncio.Queue[Any] = asyncio.Queue(_MOST_WAITING)
@@ -355,8 +351,8 @@ class Connection:
                     self._save(message.get("format"), _fit_size(message.get("size") or (1024, 1024)))
                     continue
                 command = {key: value for key, value in message.items() if key != "type"}
-                if (name := command.get("do")) in tuple(_NOT_FOR_BROWSERS):
-                    raise UsageError(f"the command {name} is not for browsers")
+                if command.get("do") == "save":  # with a path on this computer
+                    raise UsageError("the command save is not for browsers: they get a file as a download")
                 answer = await self._loop.run_in_executor(self._thread, self._session.do, command)
             except ClreconError as error:
                 self._say(error=str(error))
@@ -461,7 +457,8 @@ class Connection:
         def then(picture: Rendering) -> None:
             self._number += 1
             facts = {"view": asked.view, "number": self._number, "ms": float(picture.report.get("ms", 0.0))}
-            message = encode_picture(picture, self._ground, not asked.moving, facts)
+            is_dark = asked.view == SCENE and self._session.model.modes[self.state.mode].is_dark
+            message = encode_picture(picture, (0, 0, 0) if is_dark else self._ground, not asked.moving, facts)
             self._later(self._deliver, asked, message)
 
         try:
@@ -487,10 +484,10 @@ class Connection:
             while True:
                 await self._wake.wait()
                 self._wake.clear()
-                facts_text = json.dumps(self._facts(), separators=(",", ":"))
-                if facts_text != self._told:
-                    self._told = facts_text
-                    await self._socket.send_str(f'{{"facts":{facts_text}}}')
+                facts = {name: json.dumps(fact, separators=(",", ":")) for name, fact in self._facts().items()}
+                if news := [f'"{name}":{text}' for name, text in facts.items() if self._told.get(name) != text]:
+                    self._told = facts
+                    await self._socket.send_str(f'{{"facts":{{{",".join(news)}}}}}')
                 while self._notes:
                     await self._socket.send_str(json.dumps(self._notes.pop(0)))
                 if self._ready is not None and not self._under_way:

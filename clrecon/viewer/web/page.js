@@ -17,7 +17,7 @@
   socket.binaryType = "arraybuffer";
   const tell = (type, what) => { if (socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify({ type, ...what })); };
   const run = (name, more) => tell("command", { do: name, ...more });
-  socket.onopen = () => { message.textContent = "Building kernels: the first picture takes seconds."; layOut(); };
+  socket.onopen = () => { message.textContent = "Building kernels: the first picture takes seconds."; };
   socket.onclose = (event) => {
     const reason = { 1001: "clrecon has ended", 1006: "the connection was lost: is clrecon still running?" };
     message.textContent = `No more pictures: ${event.reason || reason[event.code] || event.code}.`;
@@ -212,17 +212,18 @@
 
   // Facts: what the panels show.
 
-  function takeFacts(now) {
-    const before = facts;
-    facts = now;
-    const told = (name) => !before || JSON.stringify(before[name]) !== JSON.stringify(now[name]);
+  // What changed of them; at first all.
+  function takeFacts(changed) {
+    const before = facts, now = facts = { ...before, ...changed }, told = (name) => name in changed;
     if (now.tool !== choosing && !["only", "hide"].includes(choosing)) choosing = now.tool || "";
     for (const id of ["iso", "tabled", "hollowed", "layouts", "spine", "windows"]) find(id).hidden = !now.iso;
     find("modes").hidden = find("modewords").hidden = now.modes.length < 2;
     if (told("iso") && now.iso) showIso();
     if (told("modes")) showModes();
     for (const button of find("modes").children) button.setAttribute("aria-pressed", String(button.dataset.mode === now.mode));
-    find("modewords").textContent = now.modes.find(({ name }) => name === now.mode).words;
+    const mode = now.modes.find(({ name }) => name === now.mode);
+    find("modewords").textContent = mode.words;
+    find("scene").classList.toggle("dark", mode.dark);
     if (now.settled && now.iso && now.modes.length > 1 && !pictured) {
       pictured = true;
       tell("thumbnails");

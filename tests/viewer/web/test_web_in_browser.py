@@ -334,10 +334,10 @@ def test_page_shows_the_description_of_its_objects(page) -> None:
     assert "a ball of triangles" in page.find_element("id", "about").text  # said of the mesh by serve_scene
 
 
-def test_removal_of_the_table_says_what_became_air(page) -> None:
+def test_removal_of_the_table_says_its_volume(page) -> None:
     page.find_element("id", "table").click()
 
-    assert wait_for(page, "return /of the voxels are air now/.test(document.getElementById('hint').textContent)")
+    assert wait_for(page, "return /table and blankets taken away/.test(document.getElementById('hint').textContent)")
 
 
 def test_key_h_lists_the_words_of_every_key(page) -> None:

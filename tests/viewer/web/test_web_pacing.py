@@ -1,4 +1,4 @@
-"""Which picture is drawn next."""
+"""Which picture is drawn next, what lies behind it, and what is told beside it."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tolerances
+from web_views import Views, browsing, serving
 
 from clrecon.viewer.model.state import SCENE
 from clrecon.viewer.web.connection import Asked, Connection, Pace, _lay_over
@@ -121,6 +122,44 @@ def test_pictures_lie_over_their_ground_rounded_to_whole_numbers(ground: tuple[i
     exact = image[..., :3] * share + np.array(ground) * (1.0 - share)
     half_a_step = 0.5 * (1 + tolerances.FLOAT64_SHARE)
     assert np.abs(_lay_over(image, ground) - exact).max() <= half_a_step
+
+
+@pytest.mark.parametrize(
+    ("mode", "behind"), [pytest.param("surface", 20, id="surface"), pytest.param("bone", 0, id="volume rendering")]
+)
+def test_ground_is_black_in_volume_rendering_and_that_of_the_page_in_surfaces(mode: str, behind: int) -> None:
+    views = Views()
+    views.painter.opacity = 0
+
+    async def browse(server: Any) -> Any:
+        async with browsing(server) as client:
+            await client.tell(do="set_mode", name=mode)
+            await client.until(lambda: client.facts.get("mode") == mode)
+            await client.tell("layout", sizes={"scene": [120, 90]}, ground=[20, 20, 20])
+            await client.until(lambda: client.pictures)
+            return client.pictures[0][1]
+
+    with serving(views.open) as server:
+        picture = asyncio.run(browse(server))
+
+    assert np.abs(np.asarray(picture, np.int64) - behind).max() <= tolerances.JPEG_GREYS
+
+
+def test_facts_that_stay_as_they_are_are_sent_once() -> None:
+    async def browse(server: Any) -> list[set[str]]:
+        async with browsing(server) as client:
+            await client.lay_out()
+            await client.until(lambda: client.pictures and client.facts["settled"])
+            before = len(client.told)
+            await client.tell(do="set_window", low=10.0, high=20.0)
+            await client.until(lambda: client.facts["window"] == [10.0, 20.0] and client.facts["settled"])
+            return client.told[before:]
+
+    with serving(Views().open) as server:
+        told = set.union(*asyncio.run(browse(server)))
+
+    assert told >= {"window", "settled"}
+    assert not told & {"modes", "parts", "bounds", "camera", "slices"}
 
 
 def test_connection_that_is_closed_twice_ends_downloads_waiting_pictures_and_session_once() -> None:

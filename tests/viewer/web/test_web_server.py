@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tolerances
 from refusals import assert_facts
 from web_views import PATIENCE, Client, Views, browsing, get_path, serving
 
@@ -20,8 +21,6 @@ from clrecon.viewer.web import connection, server
 from clrecon.viewer.web.server import WebServer
 
 pytestmark = pytest.mark.unit
-
-JPEG_GREYS = 2  # what a flat grey changes by in a picture for the browser
 
 
 @pytest.fixture
@@ -83,7 +82,7 @@ def test_browser_gets_pictures_of_the_iso_value_and_their_camera(served: WebServ
     picture = asyncio.run(browse())
 
     assert picture[0]["camera"]["parallel"]
-    assert grey(picture) == pytest.approx(200, abs=JPEG_GREYS)  # the iso value that Views begin with
+    assert grey(picture) == pytest.approx(200, abs=tolerances.JPEG_GREYS)  # the iso value that Views begin with
 
 
 def test_colours_of_a_fitted_surface_come_with_their_scale_and_a_picture(served: WebServer) -> None:
@@ -145,7 +144,7 @@ def test_view_that_changes_is_drawn_coarse_and_then_sharp_at_rest(served: WebSer
     pictures = asyncio.run(browse())
 
     assert [head["sharp"] for head, _ in pictures] == [False, True]
-    assert grey(pictures[-1]) == pytest.approx(250, abs=JPEG_GREYS)
+    assert grey(pictures[-1]) == pytest.approx(250, abs=tolerances.JPEG_GREYS)
 
 
 async def change_iso_40_times_unshown(client: Client) -> None:
@@ -179,7 +178,7 @@ def test_browser_that_shows_its_picture_late_gets_the_newest(served: WebServer) 
             await client.until(lambda: client.is_sharp and len(client.pictures) > 1)
             return client.pictures[-1]
 
-    assert grey(asyncio.run(browse())) == pytest.approx(240, abs=JPEG_GREYS)
+    assert grey(asyncio.run(browse())) == pytest.approx(240, abs=tolerances.JPEG_GREYS)
 
 
 def test_browser_that_changes_its_view_leaves_that_of_another(served: WebServer) -> None:
@@ -226,7 +225,7 @@ def test_picture_after_one_that_failed_is_shown(served: WebServer, views: Views)
             await client.until(lambda: client.is_sharp)
             return client.pictures[-1]
 
-    assert grey(asyncio.run(browse())) == pytest.approx(222, abs=JPEG_GREYS)
+    assert grey(asyncio.run(browse())) == pytest.approx(222, abs=tolerances.JPEG_GREYS)
 
 
 WRONG_MESSAGES: dict[str, tuple[object, str]] = {
