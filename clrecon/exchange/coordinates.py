@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
 from clrecon.geometry.vertices import float32_step, is_far
-from clrecon.system.pieces import find_bounds, in_threads, sort_with_rows
+from clrecon.system.pieces import find_bounds, in_threads
 
 _MOST_STEPS_APART = 64
 
@@ -97,12 +97,19 @@ def find_places(vertices: NDArray[np.floating]) -> tuple[NDArray[np.int64], NDAr
 
 
 def _find_firsts(vertices: NDArray[np.floating]) -> NDArray[np.int64]:
-    """Return the first vertex at the place of each, (n,)."""
-    count = len(vertices)
-    ordered, order = sort_with_rows(_scramble(vertices))
-    start = np.flatnonzero(np.append(True, ordered[1:] != ordered[:-1])[:count])
-    firsts = np.empty(count, np.int64)
-    firsts[order] = np.repeat(order[start], np.diff(start, append=count))
+    """Return the first vertex at the place of each, (n,), by tables in which each place has a slot, or shares it."""
+    mixed, left = _scramble(vertices), np.arange(len(vertices))
+    firsts = np.empty_like(left)
+    while len(left):
+        bits = len(left).bit_length() + 1
+        slots = mixed[left] >> np.uint64(64 - bits)
+        table = np.empty(1 << bits, np.int64)
+        table[slots[::-1]] = left[::-1]  # the first of equals, as it is the last that is written
+        owners = table[slots]
+        is_same = mixed[owners] == mixed[left]
+        firsts[left[is_same]] = owners[is_same]
+        left = left[~is_same]
+        mixed *= np.uint64(0x9E3779B97F4A7C15)  # other bits come to the top
     if not np.array_equal(vertices.take(firsts, axis=0), vertices):  # two places with one sum, or NaN
         _, first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
         firsts = first[inverse.reshape(-1)]

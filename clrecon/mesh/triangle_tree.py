@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.mesh.triangles import cross_product
-from clrecon.system.pieces import find_bounds, in_threads, sort_with_rows
+from clrecon.system.pieces import find_bounds, in_threads
 
 _LEAF, _FAN = 4, 8
 """Triangles in a leaf, and boxes in a node."""
@@ -59,7 +59,7 @@ class TriangleTree:
         self._slack = 2.0 * float(np.spacing(np.abs(lows).max() + np.abs(highs).max()))
         self._curve = Curve(lows + highs)
         codes = self._curve.codes(lows + highs)
-        order = sort_with_rows(codes.astype(np.uint64) << np.uint64(32))[1]
+        order = np.argsort(codes, kind="stable")  # mostly in order already
         order = np.concatenate([order, np.full(-len(order) % _LEAF, order[-1])])
         self._rows, self._firsts = order.reshape(-1, _LEAF), codes[order[::_LEAF]]
         of_leaves = np.ascontiguousarray(self._rows.T)  # numpy takes the least along a short last axis slowly

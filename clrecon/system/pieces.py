@@ -107,22 +107,6 @@ def list_distinct(numbers: NDArray[np.integer[Any]]) -> NDArray[Any]:
     return ordered[np.append(True, ordered[1:] != ordered[:-1])[: len(ordered)]]
 
 
-def sort_with_rows(keys: NDArray[np.uint64]) -> tuple[NDArray[np.uint64], NDArray[np.int64]]:
-    """Sort keys in place by their upper bits, equal ones by rows; return these bits, and the row of each, (n,).
-
-    Below them as many bits as the highest row has are lost: sorting keys and rows as one number takes half of the time
-    of an argsort.
-    """
-    bits = np.uint64(max(len(keys) - 1, 0).bit_length())
-    keys >>= bits
-    keys <<= bits
-    keys |= np.arange(len(keys), dtype=np.uint64)
-    keys.sort()
-    rows = (keys & ((np.uint64(1) << bits) - np.uint64(1))).view(np.int64)
-    keys >>= bits
-    return keys, rows
-
-
 def find_bounds(points: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return the lowest and highest coordinates of points, (n, 3), column by column, which is ten times faster."""
     return np.array([column.min() for column in points.T]), np.array([column.max() for column in points.T])

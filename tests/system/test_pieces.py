@@ -8,16 +8,9 @@ import numpy as np
 import pytest
 
 from clrecon.system import pieces
-from clrecon.system.pieces import deal_in_order, list_distinct, side_by_side, sort_with_rows, spread_rows
+from clrecon.system.pieces import deal_in_order, list_distinct, side_by_side, spread_rows
 
 pytestmark = pytest.mark.unit
-
-
-def test_keys_sorted_with_their_rows_keep_the_order_of_equal_ones():
-    upper = np.random.default_rng(2).integers(0, 100, 1000)
-    ordered, rows = sort_with_rows(upper.astype(np.uint64) << np.uint64(10))  # 10 bits: of rows up to 999
-    assert np.array_equal(rows, np.argsort(upper, kind="stable"))
-    assert np.array_equal(ordered, upper[rows])
 
 
 @pytest.mark.parametrize(
