@@ -180,9 +180,12 @@ class Fans(Lists):
         totals = np.zeros((len(vertices), values.shape[1]), values.dtype)
         used = count > 0
         if used.any():
+            is_most = len(rows) > len(triangles)  # each triangle's sum is looked up three times then, not made anew
             # "clip" avoids checking each index, which takes longer than the look-up.
-            first, second, third = (values.take(corners, axis=0, mode="clip") for corners in triangles[rows].T)
+            chosen = triangles if is_most else triangles[rows]
+            first, second, third = (values.take(corners, axis=0, mode="clip") for corners in chosen.T)
             of_rows = first + second + third
+            of_rows = of_rows.take(rows, axis=0, mode="clip") if is_most else of_rows
             totals[used] = np.add.reduceat(of_rows, (np.cumsum(count) - count)[used])
         return totals
 

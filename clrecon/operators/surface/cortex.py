@@ -159,14 +159,8 @@ class StackFrame:
 
 @dataclass(frozen=True, eq=False)
 class CortexConstants(Record):
-    """Constants of a scan, measured in profiles across its walls; each with the half width of what fits as well.
+    """Constants of a scan, measured in profiles across its walls, as docs/contract.md explains them.
 
-    blur_mm, blur_across_mm: Width of the Gaussian within slices and across them.
-    cortex_hu: HU of compact bone.
-    blur_error_mm, blur_across_error_mm, cortex_error_hu: How far from these the profiles are described nearly as well.
-    noise_hu: Standard deviation of the HU in soft tissue; None where there is none to measure it in.
-    residual_hu: Root mean square of what the fit leaves of these profiles.
-    places, thick: Profiles that were used, and those among them of walls that are thick enough to show their HU.
     denser: The two widths and the HU at the dense end of those that describe the profiles as well, where all walls are
         thin and alike: there only the three together are known.
     """

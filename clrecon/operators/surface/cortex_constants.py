@@ -124,10 +124,7 @@ class _Trial(NamedTuple):
     cortex_hu: float
 
     def changed(self, axes: tuple[int, ...], factor: float) -> _Trial:
-        blurs = [self.blur_mm, self.across_mm]
-        for axis in axes:
-            blurs[axis] *= factor
-        return _Trial(blurs[0], blurs[1], self.cortex_hu)
+        return self._replace(**{self._fields[axis]: self[axis] * factor for axis in axes})
 
 
 class _Walls:
@@ -152,11 +149,6 @@ class _Walls:
             self.axes = ((0,),) if high < _ACROSS_UNSEEN else ((1,),)
         elif high - low < _ONE_DIRECTION:
             self.axes = ((0, 1),)
-
-    @property
-    def unseen(self) -> list[bool]:
-        """Which of the two blurs the walls do not show by itself."""
-        return [(axis,) not in self.axes for axis in (0, 1)]
 
 
 def measure_constants(
@@ -187,7 +179,7 @@ def _measure_errors(
         parts.append((*blurs, _measure_cortex(walls, part, trial)[0]))
     if together is not None:
         trial, denser = together
-    blur_errors = [_UNSEEN_ERROR if is_unseen else _LEAST_BLUR_ERROR for is_unseen in walls.unseen]
+    blur_errors = [_LEAST_BLUR_ERROR if (axis,) in walls.axes else _UNSEEN_ERROR for axis in (0, 1)]
     least = np.array([*blur_errors, _LEAST_CORTEX_ERROR if thick >= _FEWEST_THICK else _THIN_CORTEX_ERROR])
     errors = np.maximum(np.std(parts, axis=0) / 2.0, least * np.mean(parts, axis=0)).tolist()
     if together is not None:

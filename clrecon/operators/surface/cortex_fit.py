@@ -58,10 +58,9 @@ MOST_SHIFT_MM = 2.5
 _WEIGHT_FACTOR, _LEAST_WEIGHED = 1.125, 0.054
 """By what the fit's own error is multiplied where it weighs neighbours, and what is added in squares, in blurs."""
 
-_ERROR_FACTOR, _LEAST_ERROR = 0.85, 0.03
-_COARSE_ERROR = 0.031
-"""The same of the error that is stated, and the share of step^3 / blur^2 that is added in squares: what interpolation
-between voxels blurs is known as a series of three terms."""
+_ERROR_FACTOR, _COARSE_ERROR = 1.1, 0.025
+"""By what the error from noise and from what the fit leaves is multiplied where it is stated, and the share of step^3 /
+blur^2 that is added in squares: what interpolation between voxels blurs is known as a series of three terms."""
 
 _JUDGES = 2
 """Threads that judge fits: numpy takes a quarter of the device's time."""
@@ -195,18 +194,19 @@ def judge_walls(
 def standard_errors(
     walls: WallFits, constants: CortexConstants, *, coarse_mm: Float32Array | None = None
 ) -> Float32Array:
-    """Return the standard errors of shifts, mm: noise, what the model leaves, the constants' and coarse voxels'.
+    """Return the standard errors of shifts, mm: of noise, what the model leaves, the constants, and coarse voxels.
 
     Where the cortex differs from that of the scan by more than it may, the error grows by the ratio.
 
     coarse_mm: ndarray, shape (n,). step^3 / blur^2; None: the errors by which neighbours are weighed.
     """
-    factor, least = (_WEIGHT_FACTOR, _LEAST_WEIGHED) if coarse_mm is None else (_ERROR_FACTOR, _LEAST_ERROR)
-    explained = unexplained_hu(constants.cortex_hu, constants.known_noise)
-    left = np.maximum(walls.residual_hu, np.float32(explained)) * np.float32(np.sqrt(CORRELATED_MM / STEP_MM))
-    differs = np.abs(walls.cortex_hu - constants.cortex_hu) / (constants.cortex_spread * constants.cortex_hu)
-    factors = np.maximum(differs, 1.0).astype(np.float32)
-    errors = np.hypot(np.float32(factor) * np.sqrt(walls.shift_variance) * left, np.float32(least * constants.blur_mm))
-    if coarse_mm is not None:
-        errors = np.hypot(errors, np.float32(_COARSE_ERROR) * coarse_mm)
-    return factors * errors
+    cortex, noise = constants.cortex_hu, constants.known_noise
+    if coarse_mm is None:
+        left = np.maximum(walls.residual_hu, np.float32(unexplained_hu(cortex, noise)))
+        factor, added = _WEIGHT_FACTOR, np.float32(_LEAST_WEIGHED * constants.blur_mm)
+    else:
+        left, factor = np.hypot(walls.residual_hu, np.float32(noise)), _ERROR_FACTOR
+        added = np.float32(_COARSE_ERROR) * coarse_mm
+    differs = np.abs(walls.cortex_hu - cortex) / (constants.cortex_spread * cortex)
+    errors = np.float32(factor * np.sqrt(CORRELATED_MM / STEP_MM)) * np.sqrt(walls.shift_variance) * left
+    return np.maximum(differs, 1.0).astype(np.float32) * np.hypot(errors, added)

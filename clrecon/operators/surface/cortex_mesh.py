@@ -66,24 +66,16 @@ _LEAST_CALMED, _SHORT_ROUNDS = 0.95, 8
 """Corners of triangles that would turn over go to the mean of their neighbours as long as less than this share stays
 turned, and then, in so many rounds, half back: a speck of eight triangles is turned whatever its neighbours say."""
 
+_BENT_ERROR = 0.7
+"""Error of bent surfaces, in blurs, times the root of what normals around a vertex lack of one direction."""
+
 _BIAS_ROWS = 2000
 """Vertices by which the effect of the constants on the whole surface is measured."""
 
 
 @dataclass(frozen=True, eq=False)
 class CortexReport(Record):
-    """What was found of a surface's distance from the bone, in mm.
-
-    moved: The surface was moved onto the bone; else it lies at its level, and `vertices` are those looked at.
-    constants: `CortexConstants`.
-    own_cortex_hu: HU of the cortex of large components that differ from it, each fitted with constants of its own.
-    vertices, fitted, not_bone, metal, badly_fitted, no_room: All vertices, and how many are in which state.
-    kept: Fitted vertices that were not moved by all of their shift, because the mesh would have broken.
-    outside_mm: ``mean``, ``p5``, ``p50``, ``p95`` of the way from the bone to the level's surface, outwards positive.
-    error_mm: ``p50`` and ``p95`` of the standard errors of the fitted vertices.
-    bias_mm: How far the whole fitted surface may lie off, because the constants are not known better.
-    thickness_mm: ``p5``, ``p50``, ``p95`` of the walls, and ``thin_share`` of those thinner than the blur.
-    """
+    """What was found of a surface's distance from the bone; the entries are explained in docs/contract.md."""
 
     moved: bool
     constants: CortexConstants
@@ -275,17 +267,27 @@ def fit_mesh(
         follow=partial(follow_crossings, resident.device),
     )  # fmt: skip
     steps.take()
+    moved = Mesh(vertices, mesh.triangles, vertex_normals(vertices, mesh.triangles), mesh.report)
+    np.hypot(fit.error_mm, _BENT_ERROR * fit.constants.blur_mm * measure_bends(moved, fans), out=fit.error_mm)
     fitted = fit.states == FITTED
     unmoved = int(np.count_nonzero(fitted & (np.abs(vertices - wanted).max(axis=1) > KEPT_MM)))
     known = np.isin(fit.states, (FITTED, BADLY_FITTED))
-    report = _describe_fit(fit, resident, mesh.vertices, normals, unmoved)
-    moved = Mesh(vertices, mesh.triangles, vertex_normals(vertices, mesh.triangles), {**mesh.report, "cortex": report})
+    moved.report = {**mesh.report, "cortex": _describe_fit(fit, resident, mesh.vertices, normals, unmoved)}
     moved.values = {
         "thickness_mm": np.where(known, fit.thickness_mm, np.float32(np.nan)),
         "error_mm": np.where(fitted, fit.error_mm, np.float32(np.nan)),
     }
     steps.take()
     return moved
+
+
+def measure_bends(mesh: Mesh, fans: Fans) -> NDArray[np.float32]:
+    """Return how much the normals around each vertex differ: the root of 1 less the length of their mean."""
+    assert mesh.normals is not None
+    count = (fans.begin[1:] - fans.begin[:-1]).astype(np.float32)[:, None]
+    beside = fans.sums(mesh.normals, mesh.triangles, np.arange(len(count))) - count * mesh.normals
+    lengths = np.linalg.norm(beside, axis=1) / np.maximum(2.0 * count[:, 0], 1.0)
+    return np.sqrt(np.maximum(1.0 - lengths, 0.0)).astype(np.float32)
 
 
 def fit_meshes(meshes: Sequence[Mesh], resident: DeviceVolume, *, progress: Progress = ignore_progress) -> list[Mesh]:

@@ -330,7 +330,7 @@ def test_walls_unlike_the_cortex_of_the_scan_have_errors_larger_by_a_factor_and_
     np.testing.assert_allclose(standard_errors(wall, constants), factor * standard_errors(usual, constants), rtol=1e-5)
 
 
-@pytest.mark.parametrize(("noise_hu", "error_mm", "state"), [(300.0, 0.95, "fitted"), (700.0, 3.1, "badly fitted")])
+@pytest.mark.parametrize(("noise_hu", "error_mm", "state"), [(300.0, 1.23, "fitted"), (700.0, 4.0, "badly fitted")])
 def test_walls_with_standard_errors_above_2_5_mm_are_badly_fitted(device, noise_hu, error_mm, state):
     noisy = constants_with_blurs(within_mm=0.8, across_mm=0.8).changed(noise_hu=noise_hu)
     _, fit = fit_surface(hollow_ball(thickness=1.0), device, constants=noisy)
