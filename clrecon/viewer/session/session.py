@@ -323,7 +323,7 @@ class ViewSession(Closing):
         facts = self.painter.remove_table()
         removed = [(facts[scan.number]["dense_voxels_removed"], scan.volume.spacing) for scan in self.model.scans]
         ml = sum(voxels * math.prod(spacing) / 1000.0 for voxels, spacing in removed)
-        return f"{format_volume(ml)} of table and blankets taken away: look whether the body is whole (b: show them)"
+        return f"{ml:,.0f} ml of table and blankets taken away: look whether the body is whole (b: show them)"
 
     def toggle_table(self) -> None:
         self.set_table(not self.model.state.table)

@@ -112,12 +112,9 @@ _MOVING_QUALITY, _SHARP_QUALITY = 70, 92
 
 def encode_picture(picture: Rendering, ground: tuple[int, int, int], sharp: bool, facts: dict[str, Any]) -> bytes:
     """Return the message of a picture over a ground of red, green and blue; a `sharp` one is in high quality."""
-    load_pillow()
-    from PIL import Image
-
     stream = io.BytesIO()
     quality = {"quality": _SHARP_QUALITY, "subsampling": 0} if sharp else {"quality": _MOVING_QUALITY, "subsampling": 2}
-    Image.fromarray(_lay_over(picture.image, ground)).save(stream, "JPEG", optimize=sharp, **quality)
+    _lay_over(picture.image, ground).save(stream, "JPEG", optimize=sharp, **quality)
     width, height = picture.size
     head_facts = {**facts, "sharp": sharp, "size": [width, height], "camera": facts_of_camera(picture.camera)}
     head = json.dumps(head_facts, separators=(",", ":"), allow_nan=False).encode()
@@ -139,11 +136,15 @@ def facts_of_camera(camera: Camera | None) -> dict[str, Any] | None:
     }
 
 
-def _lay_over(image: NDArray[np.uint8], ground: tuple[int, int, int]) -> NDArray[np.uint8]:
-    """Return (h, w, 3) of an image with opacity over a colour, in whole numbers: it runs while a view moves."""
-    opacity = image[..., 3:].astype(np.uint16)
-    behind = np.array(ground, dtype=np.uint16) * (255 - opacity)
-    return ((image[..., :3] * opacity + behind + 127) // 255).astype(np.uint8)
+def _lay_over(image: NDArray[np.uint8], ground: tuple[int, int, int]) -> Any:
+    """Return a picture of Pillow of an image with opacity over a colour, rounded to whole numbers."""
+    load_pillow()
+    from PIL import Image
+
+    picture = Image.fromarray(image)
+    whole = Image.new("RGB", picture.size, ground)
+    whole.paste(picture, mask=picture)
+    return whole
 
 
 @dataclass(frozen=True)
@@ -412,9 +413,7 @@ class Connection:
         self._wake.set()
 
     def _send_thumbnail(self, mode: str, picture: Rendering) -> None:
-        from PIL import Image
-
-        address = to_address(Image.fromarray(_lay_over(picture.image, (0, 0, 0))))
+        address = to_address(_lay_over(picture.image, (0, 0, 0)))
         self._later(partial(self._say, thumbnail={"mode": mode, "address": address}))
 
     def _hear(self) -> None:

@@ -55,26 +55,33 @@
     icon.append(path);
     enlarge.append(icon);
     box.append(canvas, over, enlarge);
-    return [box.dataset.view, { name: box.dataset.view, box, canvas, over, enlarge, pen: null, camera: null }];
+    const name = box.dataset.view, tab = element("button", name === "scene" ? "3D" : name, { type: "button", onclick: () => setFull(name) });
+    find("tabs").append(tab);
+    return [name, { name, box, canvas, over, enlarge, tab, pen: null, camera: null }];
   }));
+  const phone = matchMedia("(max-width: 640px)");  // one view at a time, chosen by its tab
+  phone.onchange = () => { full = ""; layOut(); };
   const isShown = (view) => !view.box.hidden && view.box.clientWidth > 0;
 
   // One view takes the place of all, or gives it back.
   function setFull(name) {
-    full = full ? "" : name;
+    full = full && !phone.matches ? "" : name;
     for (const view of Object.values(views)) view.pointer = null;  // it lies elsewhere in them now
     layOut();
   }
 
   function layOut() {
-    const alone = !facts || !facts.iso || facts.layout === "1";
+    const alone = !facts || !facts.iso || (facts.layout === "1" && !phone.matches);
     if (full && (views[full].box.hidden || (alone && SLICES.includes(full)))) full = "";
+    if (phone.matches && !full) full = "scene";
+    find("tabs").hidden = alone;
     find("stage").classList.toggle("alone", alone);
     find("stage").classList.toggle("four", !alone && facts.layout === "4");
     find("stage").classList.toggle("full", full !== "");
-    for (const { name, box, enlarge } of Object.values(views)) {
+    for (const { name, box, enlarge, tab } of Object.values(views)) {
       box.classList.toggle("large", name === full);
-      enlarge.setAttribute("aria-pressed", String(name === full));
+      for (const button of [enlarge, tab]) button.setAttribute("aria-pressed", String(name === full));
+      tab.hidden = box.hidden;
     }
     find("stage").classList.toggle("curved", !views.curve.box.hidden);
     const sharp = Math.min(devicePixelRatio || 1, 2), sizes = {};
@@ -511,7 +518,7 @@
     gather("step_iso", (old) => ({ do: "step_iso", more: { by: by + (old ? old.more.by : 0) } }));
   }, { passive: false });
   find("end").onclick = () => choose("");
-  find("along").onchange = () => { curveOff = !find("along").checked; takeFacts(facts); };
+  find("along").onchange = () => { curveOff = !find("along").checked; takeFacts({}); };
   for (const button of find("exports").children) button.onclick = () => save(button.dataset.format);
   find("clear").onclick = () => run("clear_measures");
   find("all").onclick = () => run("show_all");

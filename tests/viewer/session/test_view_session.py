@@ -339,7 +339,7 @@ def test_table_is_removed_in_the_background_and_its_volume_is_said(open_session,
 
     facts = view.facts()
     assert facts["table"] is False
-    assert f"{1.2 * np.prod(scan.spacing):,.2f} ml" in facts["said"]  # of 1,200 voxels
+    assert f"{1.2 * np.prod(scan.spacing):,.0f} ml" in facts["said"]  # of 1,200 voxels
     assert view.do({"do": "undo"})["table"]
 
 

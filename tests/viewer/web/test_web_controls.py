@@ -166,15 +166,49 @@ def test_each_control_that_is_seen_has_a_name_for_screen_readers(page) -> None:
     assert [one.get_attribute("outerHTML") for one in seen if not one.accessible_name.strip()] == []
 
 
-def test_page_is_no_wider_than_a_narrow_window(page) -> None:
+@pytest.fixture
+def phone(page):
+    """The page in a window of a phone."""
     size = {"width": 400, "height": 800, "deviceScaleFactor": 1, "mobile": False}
     page.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
     try:
         wait_for(page, "return innerWidth === 400")
-        assert page.execute_script("return document.documentElement.scrollWidth") == 400
+        yield page
     finally:
         page.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
         wait_for(page, "return innerWidth !== 400")
+
+
+def test_page_is_no_wider_than_a_narrow_window(phone) -> None:
+    assert phone.execute_script("return document.documentElement.scrollWidth") == 400
+
+
+def seen_views(page) -> list[str]:
+    script = "return [...document.querySelectorAll('.view')].filter((one) => one.clientWidth).map((one) => one.id)"
+    return page.execute_script(script)
+
+
+def test_phone_shows_the_view_of_a_tab_alone(phone) -> None:
+    wait_for(phone, "return document.querySelectorAll('#tabs button:not([hidden])').length >= 4")
+    assert seen_views(phone) == ["scene"]
+
+    phone.find_element("xpath", "//nav[@id='tabs']/button[text()='axial']").click()
+
+    assert seen_views(phone) == ["axial"]
+    wait_for(
+        phone, "return axial.clientWidth === 400 && document.documentElement.dataset.axial && clrecon.facts.settled"
+    )
+
+
+def test_wide_window_shows_all_views_again(phone) -> None:
+    phone.execute_script("clrecon.run('set_layout', { name: '1+3' })")
+    wait_for(phone, "return clrecon.facts.layout === '1+3'")
+
+    phone.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    wait_for(phone, "return innerWidth !== 400")
+
+    assert wait_for(phone, "return document.querySelectorAll('#stage.full').length === 0")
+    assert set(seen_views(phone)) >= {"scene", "axial", "coronal", "sagittal"}  # and a curve, if one was made
 
 
 def test_two_fingers_at_three_times_their_distance_zoom_the_picture_threefold(page) -> None:

@@ -121,7 +121,7 @@ def test_pictures_lie_over_their_ground_rounded_to_whole_numbers(ground: tuple[i
     share = image[..., 3:] / 255.0
     exact = image[..., :3] * share + np.array(ground) * (1.0 - share)
     half_a_step = 0.5 * (1 + tolerances.FLOAT64_SHARE)
-    assert np.abs(_lay_over(image, ground) - exact).max() <= half_a_step
+    assert np.abs(np.asarray(_lay_over(image, ground)) - exact).max() <= half_a_step
 
 
 @pytest.mark.parametrize(
