@@ -48,13 +48,8 @@ def run(options: argparse.Namespace, console: Console) -> int:
         no_clobber=options.no_clobber,
         progress=console.progress,
     )
-    console.result(result)
-    for line in _describe_bench(result):
-        console.say(line)
-    if options.report:
-        console.say(f"\nreport   {printable(options.report)}")
-    for warning in result["warnings"]:
-        console.warn(warning)
+    lines = _describe_bench(result)
+    common.show_report(result, [*lines, ""] if options.report else lines, options, console)
     return PARTLY_DONE if any(entry["error"] for entry in result["devices"]) else 0
 
 
@@ -77,9 +72,7 @@ def _describe_bench(result: dict[str, Any]) -> list[str]:
 
 
 def _describe_device(entry: dict[str, Any]) -> list[str]:
-    device = entry["device"]
-    name = printable(f"{device['name']} ({device['platform']}, driver {device['driver']})")
-    head = f"device {device['index']} {name}"
+    head = f"device {entry['device']['index']} {common.name_device(entry['device'])}"
     if entry["error"]:
         return [head, f"  failed: {printable(entry['error'])}"]
     first, warm = entry["first_seconds"], entry["warm_seconds"]

@@ -83,11 +83,12 @@ def describe_cloud_job(report: dict[str, Any]) -> list[str]:
     for step in report["steps"]:
         head = "steps    " if not lines else "         "
         lines.append(f"{head}{step['step']}: {_describe_step(step)}, {step['seconds']:.2f} s")
+    known = common.describe_known(normals=report["normals"], hu=report["has_hu"], labels=report["labels"])
     return [
         f"input    {_describe_input(report)}",
         *lines,
         *_describe_removed(report),
-        f"cloud    {count_of(report['points'], 'point')}{_describe_known(report)}",
+        f"cloud    {count_of(report['points'], 'point')}{known}",
         *_describe_surface(report["surface"]),
         f"device   {printable(report['device'])}",
         f"time     {common.describe_times(report['seconds'])}",
@@ -134,11 +135,6 @@ def _describe_removed(report: dict[str, Any]) -> list[str]:
         return []
     names = ", ".join(f"{entry['label']} {entry['reason']}" for entry in report["removed_labels"])
     return [f"removed  labels of that file: {names}"]
-
-
-def _describe_known(report: dict[str, Any]) -> str:
-    known = [word for word, name in (("normals", "normals"), ("HU", "has_hu"), ("labels", "labels")) if report[name]]
-    return f" with {', '.join(known)}" if known else ""
 
 
 def _describe_surface(surface: dict[str, Any] | None) -> list[str]:

@@ -345,14 +345,16 @@ def describe_fit(cortex: dict[str, Any]) -> str:
     return f"{share:.0f} % of it, error {cortex['error_mm']['p50']:.2f} mm"
 
 
-def show_report(report: dict[str, Any], lines: Iterable[str], options: argparse.Namespace, console: Console) -> None:
-    """Print a report: as JSON or its lines for people, and its warnings."""
+def show_report(
+    report: dict[str, Any], lines: Iterable[str], options: argparse.Namespace, console: Console, of: str = ""
+) -> None:
+    """Print a report: as JSON or its lines for people, and its warnings, or those of its part `of`."""
     console.result(report)
     for line in lines:
         console.say(line)
     if getattr(options, "report", None):
         console.say(f"report   {printable(options.report)}")
-    for warning in report["warnings"]:
+    for warning in (report[of] if of else report)["warnings"]:
         console.warn(warning)
 
 
@@ -425,6 +427,22 @@ def table(rows: Sequence[Sequence[object]], right: Sequence[int] = ()) -> list[s
 def describe_space(path: str, space: str) -> str:
     """Say in what unit and frame the coordinates of a file are: ``LPS mm``; glTF prescribes metres, Y up."""
     return "metres, Y up" if path.lower().endswith(".glb") else f"{space.upper()} mm"
+
+
+def describe_known(*, normals: bool, hu: bool, labels: bool) -> str:
+    """Name what is known of points: `` with normals, HU``; empty if nothing is."""
+    known = [word for word, is_known in (("normals", normals), ("HU", hu), ("labels", labels)) if is_known]
+    return f" with {', '.join(known)}" if known else ""
+
+
+def describe_frame(entry: dict[str, Any]) -> str:
+    """Say in which frame the coordinates of a mesh that was read are, and where that is known from."""
+    source = {"file": "named by the file", "argument": "as you say", "assumed": "assumed"}[entry["space_from"]]
+    return f"{entry['space']}, {source}{', turned to LPS' if entry['space'] != 'LPS' else ''}"
+
+
+def name_device(device: dict[str, Any]) -> str:
+    return printable(f"{device['name']} ({device['platform']}, driver {device['driver']})")
 
 
 def describe_times(seconds: Mapping[str, float], parts: Iterable[str] = ()) -> str:

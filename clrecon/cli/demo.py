@@ -27,11 +27,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     outcome = make_demo(
         options.output or DEMO_FOLDER, options.device, no_clobber=options.no_clobber, progress=console.progress
     )
-    console.result(outcome)
-    for line in _summary(outcome):
-        console.say(line)
-    for warning in outcome["mesh"]["warnings"]:
-        console.warn(warning)
+    common.show_report(outcome, _summary(outcome), options, console, of="mesh")
     return 0
 
 

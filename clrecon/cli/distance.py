@@ -94,14 +94,8 @@ def _describe_mesh(letter: str, entry: dict[str, Any]) -> list[str]:
         lines[0] += f", {common.describe_fit(entry['cortex'])}"
     size = f"{entry['triangles']:,} triangles, "
     size += "not closed" if entry["volume_ml"] is None else f"closed, {format_volume(entry['volume_ml'])}"
-    turned = ", turned to LPS" if entry["space"] != "LPS" else ""
-    source = {"file": "named by the file", "argument": "as you say", "assumed": "assumed"}[entry["space_from"]]
-    return [
-        f"{letter:<9}{printable(entry['name'])}",
-        *lines,
-        f"         {size}",
-        f"         {entry['space']}, {source}{turned}",
-    ]
+    file = f"{letter:<9}{printable(entry['name'])}"
+    return [file, *lines, f"         {size}", f"         {common.describe_frame(entry)}"]
 
 
 def _mm(value: float, sign: str = "") -> str:

@@ -380,8 +380,8 @@ def _describe_input(report: dict[str, Any]) -> str:
         return f"mesh of {report['meshes'][0]['triangles']:,} triangles"
     if cloud is None:
         return describe_volume(report["volume"])
-    known = [word for word, name in (("normals", "normals"), ("HU", "hu"), ("labels", "labels")) if cloud[name]]
-    return f"{count_of(cloud['points'], 'point')}" + (f" with {', '.join(known)}" if known else "")
+    known = common.describe_known(normals=cloud["normals"], hu=cloud["hu"], labels=cloud["labels"])
+    return f"{count_of(cloud['points'], 'point')}{known}"
 
 
 def _describe_mesh(mesh: dict[str, Any]) -> str:

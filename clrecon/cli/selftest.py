@@ -23,7 +23,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
     def tell_result(device: dict[str, Any], result: dict[str, Any]) -> None:
         if not results:
-            console.say(f"device  {_name_device(device)}")
+            console.say(f"device  {common.name_device(device)}")
         results.append(result)
         word, seconds = "pass" if result["passed"] else "FAIL", f"{result['seconds']:.2f} s"
         console.say(f"{word}  {result['operator']:{width}}  {seconds:7}  {printable(result['detail'])}")
@@ -34,10 +34,6 @@ def run(options: argparse.Namespace, console: Console) -> int:
         console.warn(warning)
     if not outcome["passed"]:
         failed = ", ".join(r["operator"] for r in outcome["operators"] if not r["passed"]) or "nothing was tested"
-        name = _name_device(outcome["device"])
+        name = common.name_device(outcome["device"])
         raise DeviceError(f"the self-test failed on {name}: {failed}; update its driver or choose another device")
     return 0
-
-
-def _name_device(device: dict[str, Any]) -> str:
-    return printable(f"{device['name']} ({device['platform']}, driver {device['driver']})")

@@ -77,7 +77,7 @@ def _lay_out(report: dict[str, Any], width: int | None) -> list[str]:
     spread = [
         ["min", *(f"{name} %" for name in percents), "max"],
         *(
-            [*_hu(one, "min_hu"), *(_format_hu(one["percentiles_hu"][name]) for name in percents), *_hu(one, "max_hu")]
+            [_format_hu(hu) for hu in (one["min_hu"], *map(one["percentiles_hu"].get, percents), one["max_hu"])]
             for one in report["labels"]
         ),
     ]
@@ -126,10 +126,6 @@ def _ml(value: float) -> str:
 
 def _mean(value: float | None) -> str:
     return "none" if value is None else f"{round(value, 1) + 0.0:.1f}"
-
-
-def _hu(entry: dict[str, Any], *fields: str) -> list[str]:
-    return [_format_hu(entry[field]) for field in fields]
 
 
 def _format_hu(value: float | None) -> str:

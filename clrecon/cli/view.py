@@ -231,6 +231,4 @@ def _describe_view(report: dict[str, Any], output: str) -> list[str]:
 def _describe_input(entry: dict[str, Any]) -> str:
     if entry["kind"] == "scan":
         return f"{describe_volume(entry['volume']) or printable(entry['name'])}, surface of {entry['surface']}"
-    turned = ", turned to LPS" if entry["space"] != "LPS" else ""
-    source = {"file": "named by the file", "argument": "as you say", "assumed": "assumed"}[entry["space_from"]]
-    return f"{printable(entry['name'])}, {entry['triangles']:,} triangles, {entry['space']}, {source}{turned}"
+    return f"{printable(entry['name'])}, {entry['triangles']:,} triangles, {common.describe_frame(entry)}"

@@ -117,11 +117,11 @@ def hash_uid(uid: str) -> str | None:
     return hashlib.sha256(uid.encode("utf-8", "replace")).hexdigest()[:16]
 
 
-def join_names(names: Iterable[object]) -> str:
+def join_names(names: Iterable[object], most: int = NAMES_SHOWN) -> str:
     """Join the first few names for a message, then a count; only the names that are shown are converted to text."""
     names = list(names)
-    shown = ", ".join(map(str, names[:NAMES_SHOWN]))
-    return shown if len(names) <= NAMES_SHOWN else f"{shown} and {len(names) - NAMES_SHOWN} more"
+    shown = ", ".join(map(str, names[:most]))
+    return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
 
 
 def to_hexadecimal(rgb: Iterable[float]) -> str:

@@ -21,6 +21,7 @@ from clrecon.points.stencil import Lattice
 from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.records import Gate
+from clrecon.system.text import join_names
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -165,7 +166,7 @@ def rules_in_lps(settings: CloudSettings) -> list[str]:
     return rules
 
 
-MOST_NAMED = 10
+_MOST_NAMED = 10
 """Most slices that a warning names."""
 
 
@@ -180,12 +181,10 @@ def find_ghosts(resident: DeviceVolume, level: float, settings: CloudSettings, p
 def warn_of_ghosts(steps: CloudSteps, ghosts: GhostSlices) -> None:
     if not ghosts.slices:
         return
-    names = ", ".join(map(str, ghosts.slices[:MOST_NAMED]))
-    more = f" and {len(ghosts.slices) - MOST_NAMED} more" if len(ghosts.slices) > MOST_NAMED else ""
     single = len(ghosts.slices) == 1
     steps.warnings.append(
-        f"{'slice' if single else 'slices'} {names}{more} of {len(ghosts.points)}, counted from 0,"
-        f" {'is' if single else 'are'} unlike both neighbours, as foreign images are; the points stay: look at"
+        f"{'slice' if single else 'slices'} {join_names(ghosts.slices, _MOST_NAMED)} of {len(ghosts.points)}, counted"
+        f" from 0, {'is' if single else 'are'} unlike both neighbours, as foreign images are; the points stay: look at"
         f" {'it' if single else 'them'}, or drop {'its' if single else 'their'} points"
         f" ({name_parameter('ghost_slices', 'drop')})"
     )

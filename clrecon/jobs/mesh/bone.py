@@ -11,7 +11,7 @@ from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Bones, Part, Surface, list_failed_values, warn_of_contrast
 from clrecon.jobs.presets import LOWEST_BONE_HU
 from clrecon.system.arguments import name_parameter
-from clrecon.system.text import count_of
+from clrecon.system.text import count_of, join_names
 
 if TYPE_CHECKING:
     import numpy as np
@@ -28,7 +28,6 @@ _CONTRAST_SHARE = 0.04
 """Share of a bone surface that looks like contrast medium and is reported from here on; spongy bone gives 0.03."""
 OTHER_SHARE = 0.05
 """Share of a surface in one component that is no bone, and is warned of from here on."""
-NAMES_SHOWN = 5
 SPINE_MM = 20.0
 """Largest distance of the wall of the spinal canal from its middle."""
 
@@ -45,33 +44,30 @@ def find_bone(
         raise UsageError("bone is told from an iso surface of HU only")
     count, labels = labelled
     judged, bone, rails = _tell_bone(mesh, volume, rule, labelled)
+
+    def warn(text: str) -> None:
+        mesh.report.setdefault("warnings", []).append(f"at {surface.describe()}{text}")
+
     if bone.any():
         if failed := list_failed_values(volume):
-            mesh.report.setdefault("warnings", []).append(
-                f"at {surface.describe()} bone was told by walls of 600 HU, and these values are not known to"
-                f" be HU ({failed[-1]['name']}): look at what was kept"
+            warn(
+                f" bone was told by walls of 600 HU, and these values are not known to be HU ({failed[-1]['name']}):"
+                " look at what was kept"
             )
         if rails.any():
             away = name_parameter("remove_table", True)
             touching = f"; table that touches bone is one component with it, {away} takes it away first"
-            mesh.report.setdefault("warnings", []).append(
-                f"at {surface.describe()} {_describe_rails(int(rails.sum()))}: left out"
-                + ("" if without_table else touching)
-            )
+            warn(f" {_describe_rails(int(rails.sum()))}: left out{'' if without_table else touching}")
         return bone
     bone = _holds_spine(mesh, volume, count, labels)
     if not bone.any():
         others = [one for one, is_rail in zip(judged, rails, strict=True) if one is not None and not is_rail]
         why = f"{_describe_none(others, count, int(rails.sum()))}{_describe_other_values(volume)}"
         if not must and list_failed_values(volume):
-            mesh.report.setdefault("warnings", []).append(
-                f"at {surface.describe()}: {why}; nothing was left out for that"
-            )
+            warn(f": {why}; nothing was left out for that")
             return None
         raise NoSurfaceError(f"at {surface.describe()}: {why} ({advice})")
-    mesh.report.setdefault("warnings", []).append(
-        f"at {surface.describe()} no component has walls like bone: the one round the spinal canal was kept"
-    )
+    warn(" no component has walls like bone: the one round the spinal canal was kept")
     return bone
 
 
@@ -249,10 +245,8 @@ def _warn_of_pieces(parts: Sequence[Part]) -> list[str]:
     names = [part.name for part in parts if part.facts["walls"]["looks_like"] == "contrast medium"]
     if not names:
         return []
-    more = f" and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
-    shown = ", ".join(names[:NAMES_SHOWN])
     return [
-        f"not bone but contrast medium or another even body by their walls: {shown}{more}"
+        f"not bone but contrast medium or another even body by their walls: {join_names(names)}"
         f" ({name_parameter('keep', 'bone')} leaves it out)"
     ]
 

@@ -10,6 +10,7 @@ from clrecon.errors import UsageError
 from clrecon.jobs.inputs import crop_labels
 from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import Progress
+from clrecon.system.text import join_names
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
@@ -18,8 +19,6 @@ if TYPE_CHECKING:
     from clrecon.labels import LabelMap
     from clrecon.mesh import Mesh
     from clrecon.opencl import Device
-
-NAMES_SHOWN = 5
 
 _FACTS = (
     "surface", "label_inside_share", "label_ml", "label_taken_ml", "vertices_by_hu_share", "mask_level", "grow_mm",
@@ -80,10 +79,9 @@ def extract_label_surfaces(
         label_surfaces += [(surface, number, mesh) for number, mesh in meshes.items()]
         left_out = [f"{number} {suffixes[number]}" for number in numbers if number not in meshes]
         if left_out:
-            more = f" and {len(left_out) - NAMES_SHOWN} more" if len(left_out) > NAMES_SHOWN else ""
             next(iter(meshes.values())).report["warnings"].append(
                 f"{len(left_out)} label{'s have' if len(left_out) > 1 else ' has'} no voxel of {surface.iso_value:g} HU"
-                f" or more in the CT and no mesh: {', '.join(left_out[:NAMES_SHOWN])}{more}"
+                f" or more in the CT and no mesh: {join_names(left_out)}"
             )
     named = []
     for surface, number, mesh in label_surfaces:

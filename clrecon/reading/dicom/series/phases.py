@@ -316,14 +316,10 @@ def describe_phases(places: Places) -> str:
     if places.problem:
         return places.problem
     phases = places.phases
-    shown = [str(phase) for phase in phases[:_PHASES_SHOWN]]
-    more = f" and {len(phases) - _PHASES_SHOWN} more" if len(phases) > _PHASES_SHOWN else ""
+    listed = join_names((f"[{phase}]" for phase in phases), _PHASES_SHOWN)
     arrangement = "whose slices lie between each other" if places.interleaved else "at the same places"
     spacing = f"; {describe_spacing(phases, phases[0])}" if places.interleaved else ""
-    return (
-        f"{len(phases)} phases {arrangement}, choose one with {name_parameter('phase')}: [{'], ['.join(shown)}]{more}"
-        f"{spacing}"
-    )
+    return f"{len(phases)} phases {arrangement}, choose one with {name_parameter('phase')}: {listed}{spacing}"
 
 
 def describe_spacing(phases: Sequence[Phase], chosen: Phase) -> str:
