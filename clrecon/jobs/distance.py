@@ -22,14 +22,13 @@ from clrecon.mesh import Mesh
 from clrecon.mesh.compare.distances import SAMPLES, DistanceSummary
 from clrecon.mesh.compare.signed import Ruler, SideDistance, compare_sides
 from clrecon.mesh.mesh_reader import read_mesh
-from clrecon.mesh.quality import survey_surface
+from clrecon.mesh.quality import MeshQuality, survey_surface
 from clrecon.system.arguments import Space, name_parameter
 from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.pieces import side_by_side
 from clrecon.system.text import escape_text, format_digits
 
 if TYPE_CHECKING:
-    from clrecon.mesh.quality import MeshQuality
     from clrecon.opencl import Device
     from clrecon.rendering import Rendering
     from clrecon.system.color_scale import ColorScale

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import NoSurfaceError, RefusedInputError, UsageError
-from clrecon.geometry import frame_from_lps
+from clrecon.geometry import Volume, frame_from_lps
 from clrecon.geometry.blocks import describe_extent
 from clrecon.geometry.certificate import amend
 from clrecon.geometry.grid import AIR_HU
@@ -24,7 +24,6 @@ from clrecon.system.progress import Progress
 from clrecon.system.text import format_digits
 
 if TYPE_CHECKING:
-    from clrecon.geometry import Volume
     from clrecon.opencl import Device
     from clrecon.operators.masks.mask import Mask
     from clrecon.operators.resident.device_volume import DeviceVolume

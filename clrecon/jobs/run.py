@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast
 from clrecon.errors import Cancelled, ClreconError, DeviceError
 from clrecon.exchange.formats import stage_assembly, stage_mesh
 from clrecon.jobs.outputs import check_files, check_kept, commit_all
-from clrecon.system.files import allow_open_files, stage_file
+from clrecon.system.files import Staged, StagedFile, allow_open_files, stage_file
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.paths import extension_of, keep_existing
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from clrecon.mesh import Mesh
     from clrecon.opencl import Device
     from clrecon.rendering.pictures.annotations import PictureData
-    from clrecon.system.files import Staged, StagedFile
 
 Found = TypeVar("Found")
 Report = TypeVar("Report", bound="JobReport")

@@ -11,14 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 from clrecon.jobs.run import Run, ScanReport
 from clrecon.jobs.settings import FITTED_FROM_HU, StatsSettings
-from clrecon.labels import resample_labels
-from clrecon.labels.statistics import PERCENTILES, check_percentiles, measure_resampled, name_percentile
+from clrecon.labels import LabelMap, resample_labels
+from clrecon.labels.statistics import PERCENTILES, LabelFigures, check_percentiles, measure_resampled, name_percentile
 from clrecon.system.light_dataclass import dataclass
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
-    from clrecon.labels import LabelMap
-    from clrecon.labels.statistics import LabelFigures
     from clrecon.opencl import Device
 
 

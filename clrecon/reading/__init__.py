@@ -12,13 +12,12 @@ from clrecon.errors import RefusedInputError, UsageError
 from clrecon.reading.common.selection import Selection, check_rescale, check_voxel_size
 from clrecon.reading.sources import Source, opened
 from clrecon.system.arguments import explains_arguments, name_parameter
-from clrecon.system.progress import ignore_progress
+from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import escape_text
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
     from clrecon.reading.common.source_facts import SeriesListing
-    from clrecon.system.progress import Progress
 
 _OTHER_FORMATS = ("NIfTI", "NRRD", "MetaImage", "OME-Zarr")
 _NAMES = (".nii", ".nii.gz", ".hdr", ".img", ".img.gz", ".nrrd", ".nhdr", ".mha", ".mhd", ".zarr")

@@ -16,9 +16,9 @@ from clrecon.jobs.inputs import describe_cloud, is_cloud_file, refuse_other_clou
 from clrecon.jobs.preprocess import Band, mask_volume, preprocess_volume, restrict_volume
 from clrecon.jobs.run import Run, RunReport
 from clrecon.points import SURFACE_KINDS, PointCloud
-from clrecon.points.ghost_slices import fill_ghost_slices
+from clrecon.points.ghost_slices import GhostSlices, fill_ghost_slices
 from clrecon.system.arguments import name_parameter
-from clrecon.system.files import allow_open_files
+from clrecon.system.files import Staged, allow_open_files
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.log import get_logger
 from clrecon.system.paths import extension_of
@@ -29,9 +29,6 @@ if TYPE_CHECKING:
     from clrecon.labels import LabelMap
     from clrecon.mesh import Mesh
     from clrecon.opencl import Device
-    from clrecon.points import PointCloud
-    from clrecon.points.ghost_slices import GhostSlices
-    from clrecon.system.files import Staged
 
 
 log = get_logger(__name__)

@@ -14,9 +14,9 @@ from clrecon.geometry import Volume
 from clrecon.jobs.cloud.settings import CloudSettings, Clustering
 from clrecon.jobs.presets import DEFAULT_PRESET, find_iso_preset
 from clrecon.jobs.run import trial_cube
-from clrecon.points import PointCloud
+from clrecon.points import PointCloud, PointStep
 from clrecon.points.cloud import count_numbers
-from clrecon.points.ghost_slices import drop_ghost_slices
+from clrecon.points.ghost_slices import GhostSlices, drop_ghost_slices
 from clrecon.points.stencil import Lattice
 from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import Progress, ignore_progress
@@ -26,12 +26,9 @@ from clrecon.system.text import join_names
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from clrecon.geometry import Volume
     from clrecon.labels import LabelMap
     from clrecon.opencl import Device
     from clrecon.operators.resident.device_volume import DeviceVolume
-    from clrecon.points import PointCloud, PointStep
-    from clrecon.points.ghost_slices import GhostSlices
 
 
 def take_points(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
 from clrecon.exchange.formats import check_assembly, check_in_pieces, describe_rounding
-from clrecon.geometry import frame_from_lps
+from clrecon.geometry import Volume, frame_from_lps
 from clrecon.jobs.mesh.bone import judge_surfaces, warn_of_walls
 from clrecon.jobs.mesh.labels import describe_label, judge_label_volumes, name_label_files
 from clrecon.jobs.mesh.make import MadeParts, first_names, label_parts, make_parts
@@ -37,7 +37,6 @@ from clrecon.system.pieces import find_bounds
 from clrecon.system.text import count_of
 
 if TYPE_CHECKING:
-    from clrecon.geometry import Volume
     from clrecon.labels import LabelMap
     from clrecon.mesh import Mesh
     from clrecon.opencl import Device

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from clrecon.errors import DeviceError, DeviceFailedError, NoSurfaceError, UsageError
-from clrecon.geometry import frame_from_lps
+from clrecon.geometry import Volume, frame_from_lps
 from clrecon.geometry.certificate import amend
 from clrecon.geometry.iso_rule import describe_range
 from clrecon.jobs.inputs import read_with_labels
@@ -35,7 +35,6 @@ from clrecon.system.text import format_ml
 
 if TYPE_CHECKING:
     from clrecon.anatomy.iso_choice import IsoChoice
-    from clrecon.geometry import Volume
     from clrecon.labels import LabelMap
     from clrecon.mesh import Mesh
     from clrecon.mesh.components import Labelled

@@ -16,7 +16,7 @@ from clrecon.jobs.presets import HIGHEST_BONE_HU, LOWEST_BONE_HU
 from clrecon.system.arguments import name_parameter
 from clrecon.system.pieces import side_by_side
 from clrecon.system.progress import Progress, Steps, ignore_progress
-from clrecon.system.records import failed_gates
+from clrecon.system.records import Gate, failed_gates
 from clrecon.system.text import format_ml
 
 if TYPE_CHECKING:
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from clrecon.mesh import Mesh
     from clrecon.mesh.connectivity import Topology
     from clrecon.opencl import Device
-    from clrecon.system.records import Gate
 
 
 _SHIFT_SHARE, _FEWEST_TOLD = 0.1, 0.5

@@ -23,7 +23,7 @@ from clrecon.jobs.preprocess import Band, mask_volume, preprocess_volume, restri
 from clrecon.jobs.render.picture_taker import Beside, PictureTaker, read_curve, read_function, read_look
 from clrecon.jobs.render.settings import LabelLook, RenderSettings
 from clrecon.jobs.run import Run, RunReport
-from clrecon.labels import file_suffixes
+from clrecon.labels import LabelMap, file_suffixes
 from clrecon.mesh import Mesh
 from clrecon.mesh.mesh_reader import read_mesh
 from clrecon.points import PointCloud
@@ -37,19 +37,15 @@ from clrecon.rendering.pictures.pillow import load_pillow
 from clrecon.rendering.pictures.styles import CurveCut, PlaneCut, Projection, Style, SurfaceLook, VolumeLook
 from clrecon.rendering.views.camera import describe_camera
 from clrecon.system.arguments import name_parameter
-from clrecon.system.files import allow_open_files
+from clrecon.system.files import StagedFile, allow_open_files
 from clrecon.system.light_dataclass import asdict, dataclass
 from clrecon.system.log import get_logger
 from clrecon.system.paths import extension_of
 from clrecon.system.progress import Progress, ignore_progress
 
 if TYPE_CHECKING:
-    from clrecon.geometry import Volume
-    from clrecon.labels import LabelMap
     from clrecon.opencl import Device
-    from clrecon.points import PointCloud
     from clrecon.rendering import Rendering, TransferFunction
-    from clrecon.system.files import StagedFile
 
 
 def describe_picture(picture: Rendering, name: str, view: str) -> dict[str, Any]:

@@ -28,7 +28,6 @@ from clrecon.system.progress import Progress, ignore_progress
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
     from clrecon.geometry.affine import Float64Array
-    from clrecon.geometry.grid import Grid
     from clrecon.labels import LabelMap
     from clrecon.mesh import Mesh
     from clrecon.opencl import Device

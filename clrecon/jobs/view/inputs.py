@@ -25,7 +25,6 @@ from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import escape_text
 
 if TYPE_CHECKING:
-    from clrecon.geometry import Volume
     from clrecon.labels import LabelMap
     from clrecon.points import PointCloud
 
