@@ -138,9 +138,9 @@ def _interpolate_aligned(
     return np.where(missing, np.float32(-1024.0), np.nan_to_num(field[0], nan=-1024.0))
 
 
-def with_border(field: Field, reach: int, mode: str = "constant") -> Field:
-    """Return slices with a border of `reach` cells: zeros, or the values at the edge with mode ``"edge"``."""
-    return np.pad(field, ((0, 0), (reach, reach), (reach, reach)), mode=mode)  # type: ignore[call-overload,no-any-return]
+def with_border(field: Field, reach: int) -> Field:
+    """Return slices with a border of `reach` cells of 0."""
+    return np.pad(field, ((0, 0), (reach, reach), (reach, reach)))
 
 
 def shifted(padded: Field, reach: int, dy: int, dx: int) -> Field:

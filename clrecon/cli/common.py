@@ -241,8 +241,8 @@ def add_fields(
 
 def add_option(container: argparse._ActionsContainer, name: str, declared: Any) -> None:
     """Add an option that no settings hold; see `clrecon.system.options.option`."""
-    own = option_beside(name, declared)
-    container.add_argument(*own.flags, dest=own.name, **own.how)
+    option = option_beside(name, declared)
+    container.add_argument(*option.flags, dest=option.name, **option.how)
 
 
 def add_output(parser: argparse._ActionsContainer, text: str, metavar: str = "OUT", *, required: bool = True) -> None:

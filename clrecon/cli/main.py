@@ -21,6 +21,7 @@ from clrecon.system.foreign_words import own_streams
 from clrecon.system.packages import hide_unused
 from clrecon.system.processes import end_process
 from clrecon.system.progress import DEFAULT_SECONDS, time_limit
+from clrecon.version import package_version
 
 
 class _Command(NamedTuple):
@@ -115,8 +116,6 @@ def _dispatch(arguments: list[str], console: Console) -> int:
     except SystemExit as stop:  # --help
         return int(stop.code or 0)
     if options.version:
-        from clrecon.version import package_version
-
         console.result({"version": package_version()})
         console.say(f"clrecon {package_version()}")
         return 0

@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     shown = parser.add_argument_group("what is shown")
     shown.add_argument("--html", metavar="FILE", help="write a page that shows the inputs: .html", first=True)
     common.add_picture(shown, "draw what the view begins with into a file: .png, .jpg or .tif")
-    common.add_option(shown, "size", size_option("pixels of the picture"))
+    common.add_option(shown, "size", size_option())
     shown.add_argument(
         "--window", action="store_true", help="open a plain window of PyVista instead of the browser", first=True
     )

@@ -151,7 +151,7 @@ def _collect_mesh(lines: Sequence[bytes], name: str) -> RawMesh:
     table = _table(vertices, "vertices", name)
     if table.shape[1] not in (3, 4, 6, 7):
         raise RefusedInputError(f"{name} is corrupt: its vertices have {table.shape[1]} numbers")
-    corners, of_normals = _corners(faces, before, len(table), name)
+    corners, of_normals = _corners(faces, before, name)
     mesh = RawMesh("OBJ", table[:, :3], corners, **read_remarks(comments))
     mesh.normals = _normals(normals, corners, of_normals, mesh, name)
     colors = table[:, -3:] if table.shape[1] >= 6 else None
@@ -177,7 +177,7 @@ def _table(rows: Sequence[bytes], noun: str, name: str) -> NDArray[np.float64]:
 
 
 def _corners(
-    faces: Sequence[bytes], before: Sequence[tuple[int, int]], vertices: int, name: str
+    faces: Sequence[bytes], before: Sequence[tuple[int, int]], name: str
 ) -> tuple[NDArray[np.int64], NDArray[np.int64] | None]:
     """Return the vertices of the faces, and their normals where each corner names one."""
     wrong = next((face for face in faces if len(face.split()) != 3), None)

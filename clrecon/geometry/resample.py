@@ -34,8 +34,8 @@ def sample_volume(volume: BaseVolume, points: Float64Array, order: int, outside:
     values = np.full(len(points), float(outside))
     interpolate = {0: _nearest, 1: _trilinear, 3: _spline}[order]
 
-    def sample(where: slice) -> None:
-        piece = points[where]
+    def sample_span(span: slice) -> None:
+        piece = points[span]
         if not np.isfinite(piece).all():
             piece = np.where(np.isfinite(piece).all(axis=1, keepdims=True), piece, np.nan)
         places = volume.lps_to_ijk(piece)
@@ -43,9 +43,9 @@ def sample_volume(volume: BaseVolume, points: Float64Array, order: int, outside:
         if is_inside.any():
             rows = np.ascontiguousarray((places if is_inside.all() else places[is_inside]).T)
             np.clip(rows, 0.0, np.array(volume.shape_ijk)[:, None] - 1.0, out=rows)
-            values[where][is_inside] = interpolate(volume.voxels, rows)
+            values[span][is_inside] = interpolate(volume.voxels, rows)
 
-    in_threads(sample, len(points), max(len(points), 1) if order == 3 else CHUNK)
+    in_threads(sample_span, len(points), max(len(points), 1) if order == 3 else CHUNK)
     return values
 
 

@@ -116,7 +116,7 @@ def measure_meshes(
         drawn = None
         if device is not None and colored is not None and files.picture is not None:
             run.progress("render", 0, 0)
-            drawn = _draw_mesh(meshes[0], colored, names[1], settings, device)
+            drawn = _draw_mesh(meshes[0], colored, settings, device)
             run.lap("render")
         outputs = _write_files(run, meshes[0], colored, drawn, files)
         run.lap("write")
@@ -152,7 +152,7 @@ class _Colored:
         return {"range_mm": self.scale.limit, "signed": self.scale.signed, "beyond_share": beyond}
 
 
-def _draw_mesh(mesh: Mesh, colored: _Colored, reference: str, settings: DistanceSettings, device: Device) -> Rendering:
+def _draw_mesh(mesh: Mesh, colored: _Colored, settings: DistanceSettings, device: Device) -> Rendering:
     from clrecon.operators.rays.mesh_pictures import box_around, mesh_corners
     from clrecon.operators.rays.scene import ScenePictures
     from clrecon.rendering.pictures.object_looks import MeshLook

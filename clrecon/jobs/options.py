@@ -222,6 +222,14 @@ def space_option(text: str, **how: Any) -> Any:
     return option("--space lps|ras", f"{text} (default: lps)", default="lps", parse=str.lower, **how)
 
 
+def check_space(space: str | None) -> None:
+    """Refuse an unknown patient frame; None is not given."""
+    from clrecon.geometry.affine import frame_from_lps  # numpy: not loaded before a job starts
+
+    if space is not None:
+        frame_from_lps(space)
+
+
 def preset_option(text: str, **how: Any) -> Any:
     return option("--preset NAME", text, parse=str.lower, **how)
 
@@ -271,8 +279,8 @@ def _parse_size(text: str) -> tuple[int, int]:
     return width, height
 
 
-def size_option(text: str, **how: Any) -> Any:
-    return option("--size W[xH]", f"{text} (default: 1024x1024)", parse=_parse_size, **how)
+def size_option(**how: Any) -> Any:
+    return option("--size W[xH]", "pixels of the picture (default: 1024x1024)", parse=_parse_size, **how)
 
 
 def label_color_option(text: str) -> Any:

@@ -20,14 +20,6 @@ FITTED_FROM_HU = find_iso_preset(DEFAULT_PRESET).iso_value
 """Level that shows the walls which are fitted, if no other is given."""
 
 
-def check_space(space: str | None) -> None:
-    """Refuse an unknown patient frame; None is not given."""
-    from clrecon.geometry.affine import frame_from_lps  # numpy: not loaded before a job starts
-
-    if space is not None:
-        frame_from_lps(space)
-
-
 def _check_surface_level(settings: StatsSettings | DistanceSettings) -> None:
     options.check_surface(settings.surface, settings.iso_value)
     if settings.iso_value is not None and settings.surface is None:
@@ -66,7 +58,7 @@ class ExportSettings(options.InputSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_space(self.space)
+        options.check_space(self.space)
         if self.resample is not None:
             from clrecon.geometry.resample import check_step
 
@@ -136,8 +128,8 @@ class DistanceSettings(options.ScanSettings, options.DeviceSettings):
     def __post_init__(self) -> None:
         from clrecon.rendering.views.directions import find_view, read_view
 
-        check_space(self.space)
-        check_space(self.mesh_space)
+        options.check_space(self.space)
+        options.check_space(self.mesh_space)
         _check_surface_level(self)
         if self.samples is not None and not 1 <= self.samples <= MOST_SAMPLES:
             raise UsageError(f"distances need 1 to {MOST_SAMPLES:,} samples on each mesh, not {self.samples:,}")
@@ -195,7 +187,7 @@ class InsideSettings(options.ScanSettings, options.DeviceSettings):
     space: Space = options.space_option("patient frame of the meshes", group="parts")
 
     def __post_init__(self) -> None:
-        check_space(self.space)
+        options.check_space(self.space)
         if not self.label:
             raise UsageError(f"choose the vertebrae by their labels: {name_parameter('label', 'L3')}")
         super().__post_init__()
@@ -299,5 +291,5 @@ class CorridorSettings(options.ScanSettings, options.DeviceSettings):
         if not (math.isfinite(self.margin) and 0.0 <= self.margin <= _LARGEST_MARGIN_MM):
             raise UsageError(f"the margin is a length from 0 to {_LARGEST_MARGIN_MM:g} mm, not {self.margin:g}")
         options.check_surface(self.surface, self.iso_value)
-        check_space(self.space)
+        options.check_space(self.space)
         super().__post_init__()

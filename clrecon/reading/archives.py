@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import bz2
+import lzma
 import os
 import stat
 import sys
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath, PureWindowsPath
+from shutil import copyfileobj, disk_usage
 from typing import IO, Any, NamedTuple
 
 from clrecon.errors import ClreconError, RefusedInputError, UsageError
@@ -69,10 +73,8 @@ def unpacked(
     if not is_archive(path):
         yield path
         return
-    import lzma  # these modules are loaded where there is an archive
-    import tarfile
+    import tarfile  # these modules are loaded where there is an archive
     import zipfile
-    import zlib
 
     file = Path(path)
     with private_folder(escape_text(file.name)) as folder:
@@ -131,8 +133,6 @@ class _Unpacking:
 
     def unpack(self, file: Path, folder: Path, depth: int = 1) -> None:
         """Unpack an archive into a folder; one that holds only archives stands for what is in these."""
-        from shutil import copyfileobj
-
         with _Zip(file, self._name) if _read_start(file).startswith(_ZIP_STARTS) else _Tar(file) as archive:
             before = self._bytes
             entries = [self._count(entry) for entry in archive.find_entries()]
@@ -175,8 +175,6 @@ class _Unpacking:
         return entry
 
     def _check_room(self, wanted: int) -> None:
-        from shutil import disk_usage
-
         free = disk_usage(self._folder).free
         if wanted > free:
             raise RefusedInputError(
@@ -207,10 +205,9 @@ class _Zip:
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         from zipfile import BadZipFile
-        from zlib import error as UnpackingError
 
         self._zip.close()
-        if self._password is not None and isinstance(error, UnpackingError | BadZipFile | EOFError):
+        if self._password is not None and isinstance(error, zlib.error | BadZipFile | EOFError):
             # One wrong password of 256 passes the check of zip, which is a byte long.
             raise UsageError(f"the password of {self._name} in {PASSWORD_VARIABLE} is wrong, or the file is damaged")
 
@@ -250,9 +247,7 @@ class _Tar:
     """A tar file, whose entries are looked at one after the other: to skip one is to unpack it."""
 
     def __init__(self, file: Path):
-        import bz2
         import gzip
-        import lzma
         import tarfile
 
         openers: dict[bytes, Callable[[Path], Any]] = {b"\x1f\x8b": gzip.open, b"BZ": bz2.open, b"\xfd7": lzma.open}

@@ -14,6 +14,7 @@ from clrecon.system.light_dataclass import dataclass
 DIRECTIONS = ("medial", "lateral", "cranial", "caudal")
 
 _RAY_STEP_MM = 0.1
+_REACH_MM = 80.0
 RAYS = 24
 STATIONS = 5
 
@@ -101,12 +102,12 @@ def canal_wall(bone: SolidBone, frame: VertebraFrame) -> NDArray[np.bool_]:
     return is_wall
 
 
-def find_exit(bone: SolidBone, start: Float64Array, direction: Float64Array, reach: float = 80.0) -> Float64Array:
+def find_exit(bone: SolidBone, start: Float64Array, direction: Float64Array) -> Float64Array:
     """Return where a ray from a point inside leaves the bone for the first time, LPS mm."""
     unit = direction / np.linalg.norm(direction)
-    steps = np.arange(0.0, reach, _RAY_STEP_MM)
+    steps = np.arange(0.0, _REACH_MM, _RAY_STEP_MM)
     outside = ~bone.is_solid(start + steps[:, None] * unit)
-    return np.asarray(start + (steps[int(outside.argmax())] if outside.any() else reach) * unit, dtype=np.float64)
+    return np.asarray(start + (steps[int(outside.argmax())] if outside.any() else _REACH_MM) * unit, dtype=np.float64)
 
 
 def measure_bias(bone: SolidBone, frame: VertebraFrame, first: Float64Array, last: Float64Array) -> Bias | None:

@@ -14,6 +14,7 @@ import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from shutil import disk_usage
 from typing import Any
 
 import numpy as np
@@ -75,8 +76,6 @@ def allocate_voxels(shape: Sequence[int], dtype: DTypeLike, name: str = "", *, m
 
 def _map_temporary(shape: Sequence[int], dtype: np.dtype[Any], needed: int, problem: str) -> NDArray[Any]:
     """Map a new file without a name, whose room on the disk is taken before anything is written."""
-    from shutil import disk_usage
-
     folder = tempfile.gettempdir()
     advice = "and the folder for temporary files has no room for it: name another with TMPDIR"
     if needed > _DISK_SHARE * disk_usage(folder).free:

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from functools import lru_cache
 
 _TEXT_LIMIT = 64
-NAMES_SHOWN = 5
+_NAMES_SHOWN = 5
 _MOST_PLACES = 12
 _LARGEST_HU, _LARGEST_WRITTEN = 1e6, 1e15
 
@@ -117,7 +117,7 @@ def hash_uid(uid: str) -> str | None:
     return hashlib.sha256(uid.encode("utf-8", "replace")).hexdigest()[:16]
 
 
-def join_names(names: Iterable[object], most: int = NAMES_SHOWN) -> str:
+def join_names(names: Iterable[object], most: int = _NAMES_SHOWN) -> str:
     """Join the first few names for a message, then a count; only the names that are shown are converted to text."""
     names = list(names)
     shown = ", ".join(map(str, names[:most]))

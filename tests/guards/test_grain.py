@@ -22,7 +22,7 @@ CEILINGS = {
 """Who takes something away lowers the figure in the same commit; who needs more says why in the commit."""
 
 HABITS = {
-    "functions_with_pronouns": 29,
+    "functions_with_pronouns": 26,
     "functions_without_object": 45,
     "assignments_of_three": 19,
     "nested_conditionals": 0,

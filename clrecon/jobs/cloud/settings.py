@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from clrecon.errors import UsageError
-from clrecon.jobs.options import InputSettings, hu_option, label_map_option, label_option, parse_point, space_option
+from clrecon.jobs import options
 from clrecon.points import POINT_KINDS, SURFACE_KINDS
 from clrecon.system.arguments import PointKind, Space, name_parameter
 from clrecon.system.light_dataclass import dataclass, replace
@@ -70,18 +70,18 @@ def _parse_level(text: str) -> float | tuple[float, ...]:
 def _parse_clusters(text: str) -> dict[str, Any]:
     """Read ``eps=MM,min=N`` (either may be missing) as fields of `Clustering`, which is checked with the others."""
     known = {"eps": "eps", "min": "min_samples"}
-    options: dict[str, Any] = {}
+    given: dict[str, Any] = {}
     for part in text.split(","):
         name, equals, value = (word.strip() for word in part.partition("="))
-        if not equals or name not in known or known[name] in options:
+        if not equals or name not in known or known[name] in given:
             raise ValueError(f"{text!r} is not eps=MM,min=N, such as eps=1.2,min=6")
         try:
-            options[known[name]] = (
+            given[known[name]] = (
                 value if value == "plane+1" and name == "min" else (float if name == "eps" else int)(value)
             )
         except ValueError:
             raise ValueError(f"{text!r}: {name} is no number: {value!r}") from None
-    return options
+    return given
 
 
 def _parse_denoisers(text: str) -> tuple[str, ...]:
@@ -94,10 +94,10 @@ _steps_option = partial(option, group="steps")
 
 
 @dataclass(frozen=True)
-class CloudSettings(InputSettings):
+class CloudSettings(options.InputSettings):
     """Settings of the cloud job; options say in their help what they do.  `keep` alone has the default clusters."""
 
-    space: Space = space_option("patient frame of the written files and of seeds")
+    space: Space = options.space_option("patient frame of the written files and of seeds")
     input_space: Space | None = option(
         "--input-space lps|ras",
         "patient frame of a cloud file that does not say its own (default: lps)",
@@ -111,15 +111,17 @@ class CloudSettings(InputSettings):
         parse=str.lower,
         first=True,
     )
-    hu: float | Sequence[float] | None = hu_option(
+    hu: float | Sequence[float] | None = options.hu_option(
         "iso value, inside is N and above; or a band, both ends included (default: the preset bone)",
         "N|LO,HI",
         group="points",
         parse=_parse_level,
         first=True,
     )
-    labels: str | Path | None = label_map_option(group="points")
-    label: str | None = label_option("use only the points of this label (default: all)", group="points", action=None)
+    labels: str | Path | None = options.label_map_option(group="points")
+    label: str | None = options.label_option(
+        "use only the points of this label (default: all)", group="points", action=None
+    )
     paper: bool = _points_option(
         "--paper", "place and filter voxels as the papers print it, and report the resulting error"
     )
@@ -170,7 +172,7 @@ class CloudSettings(InputSettings):
         "--viewpoint X,Y,Z",
         "a point inside the object, mm in the frame of --space: normals of a cloud file point away from it (those of a"
         " scan follow the HU)",
-        parse=parse_point,
+        parse=options.parse_point,
     )
     spacing: float | None = _steps_option("--spacing MM", "keep one point for each cell of that size")
     allow_point_loss: bool = option(
@@ -181,9 +183,7 @@ class CloudSettings(InputSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        from clrecon.geometry import frame_from_lps  # numpy: not loaded before a job starts
-
-        frame_from_lps(self.space)
+        options.check_space(self.space)
         _check_choice("points are", self.points, POINT_KINDS)
         _check_choice("points of ghost slices are kept or dropped:", self.ghost_slices, _GHOSTS)
         for name in self.denoise:

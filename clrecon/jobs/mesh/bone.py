@@ -45,29 +45,29 @@ def find_bone(
     count, labels = labelled
     judged, bone, rails = _tell_bone(mesh, volume, rule, labelled)
 
-    def warn(text: str) -> None:
+    def add_warning(text: str) -> None:
         mesh.report.setdefault("warnings", []).append(f"at {surface.describe()}{text}")
 
     if bone.any():
         if failed := list_failed_values(volume):
-            warn(
+            add_warning(
                 f" bone was told by walls of 600 HU, and these values are not known to be HU ({failed[-1]['name']}):"
                 " look at what was kept"
             )
         if rails.any():
             away = name_parameter("remove_table", True)
             touching = f"; table that touches bone is one component with it, {away} takes it away first"
-            warn(f" {_describe_rails(int(rails.sum()))}: left out{'' if without_table else touching}")
+            add_warning(f" {_describe_rails(int(rails.sum()))}: left out{'' if without_table else touching}")
         return bone
     bone = _holds_spine(mesh, volume, count, labels)
     if not bone.any():
         others = [one for one, is_rail in zip(judged, rails, strict=True) if one is not None and not is_rail]
         why = f"{_describe_none(others, count, int(rails.sum()))}{_describe_other_values(volume)}"
         if not must and list_failed_values(volume):
-            warn(f": {why}; nothing was left out for that")
+            add_warning(f": {why}; nothing was left out for that")
             return None
         raise NoSurfaceError(f"at {surface.describe()}: {why} ({advice})")
-    warn(" no component has walls like bone: the one round the spinal canal was kept")
+    add_warning(" no component has walls like bone: the one round the spinal canal was kept")
     return bone
 
 
@@ -216,14 +216,14 @@ def warn_of_walls(parts: Sequence[Part], settings: MeshSettings, choice: IsoChoi
         if settings.split:
             warnings += _warn_of_pieces(members)
         elif members:
-            boneless = _warn_of_no_bone(members[0], settings)
+            boneless = _warn_of_no_bone(members[0])
             if boneless and choice is not None and choice.contrast_medium_share:
                 contrast = []  # the same figures, with advice that helps only if there is bone
             warnings += boneless or _warn_of_whole(members[0], settings)
     return contrast + warnings
 
 
-def _warn_of_no_bone(part: Part, settings: MeshSettings) -> list[str]:
+def _warn_of_no_bone(part: Part) -> list[str]:
     """Return the warning for a surface at a level of bone without any bone component."""
     from clrecon.mesh.compare.walls import looks_like_bone
 

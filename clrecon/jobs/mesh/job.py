@@ -9,6 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from clrecon.errors import UsageError
 from clrecon.exchange.formats import check_assembly, check_in_pieces, describe_rounding
 from clrecon.geometry import Volume, frame_from_lps
@@ -366,8 +368,6 @@ class _PassingMeshes:
             return [self._write(resident, spans, *each) for each in zip(surfaces, self.paths, strict=True)]
 
     def _write(self, resident: DeviceVolume, spans: MakeSpans | None, surface: Surface, path: str | Path) -> Mesh:
-        import numpy as np
-
         from clrecon.mesh import Mesh
         from clrecon.mesh.written_parts import PartsFile
         from clrecon.operators.surface.spans import PassingSurface

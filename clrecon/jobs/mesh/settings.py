@@ -288,10 +288,9 @@ class MeshSettings(options.SharedSettings):
                 f"there is one mesh: {name_parameter('one_file', True)} puts labels, components"
                 f" ({name_parameter('split', True)}) or several iso values into one file"
             )
-        from clrecon.geometry import frame_from_lps  # numpy: not loaded before a job starts
-        from clrecon.geometry.iso_rule import check_topology
+        from clrecon.geometry.iso_rule import check_topology  # numpy: not loaded before a job starts
 
-        frame_from_lps(self.space)
+        options.check_space(self.space)
         check_topology(self.topology)
         if self.grow_from or self.method_used != "t-mc" or self.vertex_rule != "linear":
             check_growing(

@@ -195,7 +195,7 @@ class RenderSettings(options.SharedSettings):
         "LPS mm at the centre of the picture, also of a slice (default: the centre of what is shown)",
         parse=numbers_reader(3, "is not a place X,Y,Z in LPS mm, such as -12,40,310"),
     )
-    size: tuple[int, int] | None = options.size_option("pixels of the picture", group="camera", first=True)
+    size: tuple[int, int] | None = options.size_option(group="camera", first=True)
     view_angle: float | None = _camera_option(
         "--perspective DEGREES",
         f"perspective of this many degrees from bottom to top ({DEFAULT_VIEW_ANGLE:g} without a number; default:"
@@ -269,8 +269,10 @@ class RenderSettings(options.SharedSettings):
         if self.mesh_space is not None:
             frame_from_lps(self.mesh_space)
             if not self.meshes and self.mode != "mesh":
-                what = name_parameter("mesh_space")
-                raise UsageError(f"{what} says how meshes lie in the patient: name one with {name_parameter('meshes')}")
+                space = name_parameter("mesh_space")
+                raise UsageError(
+                    f"{space} says how meshes lie in the patient: name one with {name_parameter('meshes')}"
+                )
         for name in ("letters", "zoom", "view_angle", "center", "turntable", "meshes"):
             if getattr(self, name) != _DEFAULTS[name]:
                 check_known(self.mode, name)

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 from clrecon.errors import UsageError
 from clrecon.jobs.mesh.settings import MeshSettings
-from clrecon.jobs.options import mesh_space_option
-from clrecon.jobs.settings import check_space
+from clrecon.jobs.options import check_space, mesh_space_option
 from clrecon.system.arguments import Space
 from clrecon.system.light_dataclass import dataclass, field, replace
 from clrecon.system.options import option
