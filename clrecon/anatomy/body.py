@@ -1,10 +1,8 @@
 """The patient's body in a scan: found without table and blankets, or cut out by the circle that was reconstructed.
 
-The body is found on a grid of cells of about 2 mm.  Dense cells, and the cavities that they enclose (lungs, bowel,
-sinuses), are opened slice by slice (morphological opening), which removes plates: table tops, shells, straps.  The
-remaining pieces are separated in three dimensions.  Every thick piece is kept, arms and legs too; thin parts that hang
-on it (ears, nose, fingers) are added again unless they are as long as a table.  Everything else becomes air.  A margin
-around the body stays untouched, so that the edge of the skin is as it was measured.
+Dense cells of about 2 mm, and the cavities that they enclose, are opened slice by slice (morphological opening), which
+removes plates: table tops, shells, straps.  Thick pieces are kept, and thin parts that hang on them unless they are as
+long as a table (docs/table.md).  A margin stays untouched, so that the edge of the skin is as it was measured.
 """
 
 from __future__ import annotations

@@ -1,18 +1,7 @@
-"""Pieces as dense as bone: which belong to the body, which are equipment, and what share of the bone stays.
+"""Pieces as dense as bone, connected components of cells that hold voxels above `DENSE_HU`: which belong to the body.
 
-Bars, rails and pieces of metal beside a patient are as hard as bone.  A bar has the same cross section from end to end,
-and no marrow; a bone tapers, bends and is hollow.  Metal has HU that bone has not.  What lies in soft tissue is left to
-the patient: it may be the bone of a thin limb.
-
-A piece is a connected component of cells that hold voxels above `DENSE_HU`.  Three facts tell bone from a table:
-
-- Plastic and carbon fibre have next to no voxels above `HARD_HU`; bone has, teeth and metal too.
-- A table moves through the scanner along the step of the slices, so its cross section is the same in all of them:
-  columns of its cells are filled from the first slice to the last.  Bones taper and bend.
-- Plates and rails are thin.
-
-A patient has more soft tissue than bone; a dry specimen has none.  In the scan of a patient a piece is kept if most of
-it lies within the body, or if it is large enough to be a second body; in that of a specimen, if it is not a table.
+docs/table.md has the rules.  What lies in soft tissue is left to the patient: it may be the bone of a thin limb.  A dry
+specimen has no soft tissue; there a piece is kept if it is not a table.
 """
 
 from __future__ import annotations
@@ -180,12 +169,7 @@ def find_dense_pieces(cells: Cells, tissue: Mask, thick: Mask, body: Mask) -> De
 
 
 def _of_patient(cells: Cells, tissue: Mask, body: Mask) -> DensePieces:
-    """Decide for the scan of a patient.
-
-    Pieces that lie mostly within the body are added.  Hard pieces that partly reach into it count as bone.  A hard
-    piece apart from the body counts too, unless it is a cable or as straight as a table; a large one is also added, as
-    a second body.  Bars and metal beside the body are neither.
-    """
+    """Decide for the scan of a patient, see docs/table.md; pieces that lie mostly within the body are added."""
     pieces = _label(cells, cells.dense > 0)
     hard = pieces.is_hard
     inside = pieces.share_in(cells, body)

@@ -70,8 +70,7 @@ def warn_of_skin(volume: Volume, vertices: NDArray[Any], triangles: NDArray[Any]
 def measure_skin(volume: Volume, vertices: NDArray[Any], triangles: NDArray[Any]) -> float:
     """Measure the area of a surface, whose triangles face outwards, that lies beside the air around a patient, in cm2.
 
-    Right to some cm2: the air is told once for each volume, on a grid of about 2 mm and without passages narrower than
-    `OPEN_MM`, and at most `MOST_SAMPLES` triangles stand for all.
+    Right to some cm2: the air is told on a grid of about 2 mm, and at most `MOST_SAMPLES` triangles stand for all.
     """
     if volume not in _airs:
         _airs[volume] = _outer_air(volume)

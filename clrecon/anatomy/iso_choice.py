@@ -1,21 +1,10 @@
-"""The iso value half way between bone and the tissue beside it, measured at edges of bone in the scan itself.
+"""The iso value half way between bone and the tissue beside it, measured at edges of bone: the steps are in
+docs/iso_value.md.
 
-A scanner blurs every edge.  Only the level half way between the two plateaus leaves the edge in its place: a level that
-is off by 20 % of the step moves the surface by about half a voxel, at a blur of 0.8 voxel.  Bone has no peak of its own
-in the histogram of a body, because marrow, thin cortex and contrast medium have the same values.  So the plateaus are
-measured at the edges:
-
-1. The histogram of evenly spread slices gives the soft-tissue mode and its noise.  Padding, air, table and fat lie
-   elsewhere and do not move it.
-2. Seeds are crossings of a value safely above that mode, along the rows and columns of those slices, where the edge
-   runs more across this axis than along it.
-3. From each seed a walk uphill to the first maximum gives the bone's plateau, one downhill the tissue's.  Edges that
-   start from air (table, lung, clothes), end in metal, or end in a flat and faint plateau (vessels and organs with
-   contrast medium) do not count.
-4. The medians of both plateaus, every edge weighted by its contrast, are "bone" and "tissue"; the iso value is half
-   way between them.
-
-Noise lifts a maximum as much as it lowers a minimum, which leaves the middle in place."""
+A scanner blurs every edge.  Only the level half way between the two plateaus leaves the edge in its place.  Bone has no
+peak of its own in the histogram of a body, because marrow, thin cortex and contrast medium have the same values.  Noise
+lifts a maximum as much as it lowers a minimum, which leaves the middle in place.
+"""
 
 from __future__ import annotations
 

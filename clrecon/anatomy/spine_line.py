@@ -1,16 +1,8 @@
-"""The spinal canal: a centre line of the vertebral column for curved reformations, and the ends of the canal.
+"""The spinal canal of an adult: a centre line for curved reformations, and the ends of the canal (docs/slices.md).
 
-In slices across the patient every place is compared with what the middle of the spinal canal looks like.  It is soft.
-Cortical bone encloses it in all directions (up to 12 mm above and below, so that arches close the gaps between them).
-There is a vertebral body in front and nothing but muscle behind, and the left mirrors the right.  Dynamic programming
-finds the path through the slices that agrees best.  The path is the canal where it agrees over enough height.  Each
-slice's point is then moved to the middle of the space that the bone encloses, and the line is smoothed.
-
-Beyond the sure slices the place of the canal is known, so less is needed of the next slice: left and right may differ,
-as in a scan that is cropped at one side.  All other traits stay: without the vertebral body in front the way would go
-on in the soft tissue before the sacrum.
-
-The search is meant for the spine of an adult, in a scan whose axes are those of the patient.
+The path is the canal where it agrees over enough height.  Beyond the sure slices the place of the canal is known, so
+less is needed of the next slice: left and right may differ, as in a scan that is cropped at one side.  All other traits
+stay: without the vertebral body in front the way would go on in the soft tissue before the sacrum.
 """
 
 from __future__ import annotations

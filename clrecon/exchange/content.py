@@ -342,8 +342,6 @@ def _describe_inside(ends: Sequence[float | None] | None) -> str | None:
 
 
 class Writable(Protocol):
-    """Protocol of an object that can be written: a `Mesh`."""
-
     @property
     def triangle_count(self) -> int: ...
     @property

@@ -214,8 +214,6 @@ _KEPT_BY_OTHERS = ("normals", "hu", "labels")
 
 
 class WritableCloud(Protocol):
-    """Protocol of an object that can be written: a `PointCloud`."""
-
     def __len__(self) -> int: ...
     def describe(self, space: str, *, keep_ids: bool = False, with_ijk: bool = True) -> PointContent: ...
 

@@ -164,7 +164,6 @@ def _collect_mesh(lines: Sequence[bytes], name: str) -> RawMesh:
 
 
 def _table(rows: Sequence[bytes], noun: str, name: str) -> NDArray[np.float64]:
-    """Return the numbers of lines that have equally many."""
     widths = {row.count(b" ") for row in rows}
     split = [row.split() for row in rows] if len(widths) > 1 or any(b"  " in row for row in rows[:1]) else None
     width = len(rows[0].split()) if rows else 3
@@ -240,7 +239,6 @@ def _parts(
 
 
 def _one_color(corners: NDArray[np.int64], colors: NDArray[np.float64] | None) -> tuple[float, float, float] | None:
-    """Return the colour that all these corners have."""
     if colors is None or not _are_within(corners, len(colors)):
         return None
     rows = colors[corners.ravel()]

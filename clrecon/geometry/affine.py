@@ -1,14 +1,8 @@
 """The affine from voxel indices (i, j, k) to patient millimetres, what follows from it, and patient frames.
 
-An affine is always a 4x4 float64 array that maps column vectors (i, j, k, 1) to (x, y, z, 1) in LPS mm: its columns are
-the step from one column of a slice to the next, from one row to the next, from one slice to the next, and the centre of
-voxel (0, 0, 0).  The slice step is a full vector: with a tilted gantry it is not parallel to the slice normal, and the
-affine is then an exact shear.
-
-Inside clrecon everything is LPS mm; RAS exists only at the border, under its own name.  LPS: x to the patient's left, y
-to the posterior, z to the superior (DICOM).  RAS: x right, y anterior (NIfTI).
-
-Source: DICOM PS3.3 C.7.6.2.1.1 (Image Position and Image Orientation), with the slice step added.
+It is a 4x4 float64 array that maps (i, j, k, 1) to (x, y, z, 1) in LPS mm (x to the patient's left, y to the posterior,
+z to the superior); docs/geometry.md derives it from DICOM.  The slice step is a full vector: with a tilted gantry the
+affine is an exact shear.  RAS (NIfTI) exists only at the border, under its own name.
 """
 
 from __future__ import annotations

@@ -41,8 +41,6 @@ log = get_logger(__name__)
 
 
 class Laps:
-    """Seconds by part of a job, on the wall clock."""
-
     def __init__(self) -> None:
         self._start = self._lap = perf_counter()
         self.seconds: dict[str, float] = {}
@@ -57,7 +55,6 @@ class Laps:
         return elapsed
 
     def total(self) -> float:
-        """Seconds since the first lap began."""
         return perf_counter() - self._start
 
     def rounded(self, parts: Sequence[str] = ()) -> dict[str, float]:

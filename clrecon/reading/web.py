@@ -248,8 +248,6 @@ def _describe_error(error: object) -> str:
 
 
 class WebFile:
-    """A file of the web: an archive, or a scan in one file."""
-
     def __init__(self, parts: SplitResult, patience: Patience = Patience()):  # noqa: B008 (a tuple)
         self._url, self._patience = web_url(parts), patience
         self._name = shown_url(self._url)

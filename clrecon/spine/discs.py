@@ -1,8 +1,7 @@
 """The course of the spine, and the discs between vertebral bodies, found together in the scan along the canal.
 
-A disc is a plane that is darker than the planes on either side of it: the marrow and end plates in its middle, and the
-cortex around it.  Planes of all tilts are tried, because the discs of the loin stand askew to the canal.  Dynamic
-programming then chooses the planes that agree best as a row: 15 to 46 mm apart, and neighbouring gaps alike.
+A disc is a plane that is darker than those on either side.  Planes of all tilts are tried, as the discs of the loin
+stand askew to the canal; dynamic programming chooses those that agree best as a row, 15 to 46 mm apart.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """The frame of one vertebra, found in its label: canal, body, endplates.
 
-The vertebral canal is where one can look through the vertebra: the direction in which the hole of its projection is
-widest is that of the canal.  The body is where the label is deepest.  The endplates, planes fitted to the ends of the
-body, give the cranial direction.  The median plane is that by which the label is most like its mirror image.
+The canal runs where the hole of the label's projection is widest, the body is where the label is deepest, planes fitted
+to its ends give the cranial direction, and the median plane is that by which the label is most like its mirror image.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ is; `clrecon.errors.Cancelled` is there for that."""
 
 
 def ignore_progress(stage: str, done: int = 0, total: int = 0) -> None:
-    """A progress function that does nothing."""
+    """Do nothing."""
 
 
 class Steps:

@@ -95,8 +95,6 @@ _camera_option = partial(option, group="camera")
 
 @dataclass(frozen=True)
 class Turntable:
-    """Settings of a turntable, an animation of a turning volume."""
-
     frames: int = option("--frames N", "frames of the turn (default: 100)", default=100)
     fps: float = option("--fps N", "frames per second (default: 25)", default=25.0)
     degrees: float = option("--degrees D", "angle of the turn, to the patient's left (default: 360)", default=360.0)

@@ -282,7 +282,6 @@ def open_packer(stream: BinaryIO) -> Any:
 
 
 def write_slices(stream: Any, content: VolumeContent) -> None:
-    """Write the voxels, little endian."""
     for k, layer in enumerate(content.voxels):
         stream.write(layer.astype(layer.dtype.newbyteorder("<"), copy=False).tobytes())
         content.progress("write", k + 1, len(content.voxels))

@@ -135,7 +135,6 @@ class Series:
 
     @property
     def key(self) -> str:
-        """The identification that all parts of one series share."""
         return _group_key((self.headers or self.others)[0])
 
     @cached_property

@@ -1,13 +1,9 @@
 """Mixtures: slices of several volumes that lie between each other, and elements that alternate along a stack.
 
-Two reconstructions half a gap apart, or two acquisitions that overlap, share no place.  Sorted by position they look
-like one stack that alternates between two volumes, evenly spaced or not.
-
-Any element may distinguish them: a time, the contrast medium, an acquisition number that only one of them has, a
-private element.  So all headers of the stack are read again completely, for every element whose values repeat in a
-fixed order along it: ABAB, ABCABC, AABB. Within one volume values stay, count on, or change at single places; or they
-alternate with the turns of the gantry.  So in an even stack only elements that are constant within a volume, for the
-reason given here, make phases; of all others the pixels decide.  docs/geometry.md has the same table.
+Two reconstructions half a gap apart, or two acquisitions that overlap, share no place.  Any element may distinguish
+them, so all headers of the stack are read again for every element whose values repeat in a fixed order along it: ABAB,
+ABCABC, AABB.  Within one volume values stay, count on, change at single places, or alternate with the turns of the
+gantry: so in an even stack only elements that are constant within a volume make phases, of others the pixels decide.
 """
 
 from __future__ import annotations
