@@ -280,7 +280,8 @@ def _parse_size(text: str) -> tuple[int, int]:
 
 
 def size_option(**how: Any) -> Any:
-    return option("--size W[xH]", "pixels of the picture (default: 1024x1024)", parse=_parse_size, **how)
+    width, height = how.get("default") or (1024, 1024)
+    return option("--size W[xH]", f"pixels of the picture (default: {width}x{height})", parse=_parse_size, **how)
 
 
 def label_color_option(text: str) -> Any:

@@ -36,7 +36,6 @@ _REFUSED_CODES = (2, 3, 4)
 """Exit codes of verdicts on the input and the settings, which another run repeats; others may be luck of the run."""
 
 PICTURE, LABELS = "picture.png", "labels.csv"
-_PICTURE_SIZE = (360, 360)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -176,7 +175,7 @@ def _fill_folder(case: Case, plan: Plan, run: Run, folder: Path, key: str | None
     if shared is not None and plan.drawer is not None:
         draw = resolve_name(plan.drawer)
         shown = MeshSettings(**_settings_in(settings, InputSettings))
-        how = {"size": _PICTURE_SIZE, "carried": plan.carried, "read": shared.read}
+        how = {"size": asked.size, "carried": plan.carried, "read": shared.read}
         warnings += draw(case.source, case.labels, shown, folder / PICTURE, **how)
         run.lap("picture")
     elif asked.picture:
@@ -232,7 +231,7 @@ def _take_pictures(folder: Path, asked: BatchSettings, settings: MeshSettings) -
     first, *others = sorted(folder.glob(f"mesh*{asked.format}"))
     meshes = tuple(MeshFile(str(path)) for path in others)
     look = RenderSettings.of(
-        "mesh", meshes=meshes, mesh_space=settings.space, size=_PICTURE_SIZE, device=settings.device,
+        "mesh", meshes=meshes, mesh_space=settings.space, size=asked.size, device=settings.device,
         memory=settings.memory, views=asked.views,
     )  # fmt: skip
     return make_pictures(first, PictureFiles(folder / PICTURE), look).warnings

@@ -25,6 +25,7 @@ from clrecon.jobs.options import (
     locate_region_rule,
     parse_region_rules,
     scheduler_option,
+    size_option,
     view_option,
 )
 from clrecon.reading import tell_format
@@ -71,6 +72,7 @@ def _parse_extension(text: str) -> str:
 
 
 _VIEWS: tuple[str, ...] = get_args(DirectionName)
+_SIZE = (360, 360)
 
 
 def _parse_views(text: str) -> tuple[str, ...]:
@@ -120,6 +122,7 @@ class BatchSettings:
         parse=_parse_views,
         words=_VIEWS,
     )
+    size: tuple[int, int] = size_option(group="make", default=_SIZE)
     state: str | None = option(
         "--state FILE",
         "draw each case as in a saved view (.view.json) of one scan: from its direction, framed anew, without what lies"
@@ -173,6 +176,10 @@ class BatchSettings:
         if self.state is not None and not (self.picture and self.views == (_VIEWS[0],)):
             option_beside = name_parameter("views") if self.picture else name_parameter("picture", True)
             raise UsageError(f"{name_parameter('state')} draws one picture as saved: leave {option_beside} out, or it")
+        if self.size != _SIZE:
+            from clrecon.rendering.views.directions import checked_size
+
+            checked_size(self.size)
         if self.workers is not None and not 1 <= self.workers <= _MOST_WORKERS:
             raise UsageError(f"a batch takes 1 to {_MOST_WORKERS} workers, not {self.workers}")
         if self.devices not in (None, ALL_DEVICES) and not all(

@@ -116,14 +116,8 @@ def carry_view(saved: Mapping[str, Any]) -> dict[str, Any]:
         looks = [each for each in saved["parts"] if each["kind"] not in ("cluster", "rest")]
     except (KeyError, TypeError) as error:
         raise RefusedInputError(f"the saved view is damaged: {escape_text(str(error), 120)}") from None
-    of_one_patient: dict[str, Any] = {
-        "turn": None,
-        "compare": None,
-        "slices": [],
-        "measures": [],
-        "clip_box_lps_mm": None,
-    }
-    return {**saved, **of_one_patient, "parts": looks}
+    of_patient: dict[str, Any] = {"turn": None, "compare": None, "slices": [], "measures": [], "clip_box_lps_mm": None}
+    return {**saved, **of_patient, "parts": looks}
 
 
 def restore_elsewhere(carried: Mapping[str, Any], model: ViewModel) -> None:

@@ -227,14 +227,12 @@ class ViewSession(Closing):
     def facts(self) -> dict[str, Any]:
         """Return all that panels show, for JSON."""
         with self._lock:
-            busy = [_WORDS.get(kind, kind) for kind in self._work.busy]
-            notes = self.model.facts()
             return {
-                **notes,
+                **self.model.facts(),
                 "seen_lines": self._seen_lines(),
                 "scale": self._describe_scale(),
                 "offset": self.painter.find_offset(self.model.state),
-                "busy": busy,
+                "busy": [_WORDS.get(kind, kind) for kind in self._work.busy],
                 "error": self._error,
                 "said": self._said,
                 "timing": self._timing,

@@ -12,7 +12,7 @@ from label_files import write_nifti
 from PIL import Image
 
 from clrecon.cli.main import main
-from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.jobs.view import ViewSettings
 from clrecon.viewer.session.opening import open_view
 
@@ -89,6 +89,42 @@ def test_picture_of_a_case_is_that_of_render_from_the_side_of_the_saved_view_fra
     assert (output / "A" / "picture.png").read_bytes() == (tmp_path / "a.png").read_bytes()
 
 
+@pytest.fixture(scope="module")
+def labelled(cohort: Path) -> Path:
+    """The cohort with a label map of the first scan, labelled.csv that names it, and labelled.view.json: the labels
+    alone, the first of the two hidden.
+    """
+    voxels = np.zeros((24, 24, 24), np.uint8)
+    voxels[6:18, 6:18, 6:12], voxels[6:12, 6:18, 12:18] = 1, 2
+    write_nifti(cohort / "labels.nii", voxels, np.diag([2.0, 2.0, 2.0, 1.0]))
+    (cohort / "labelled.csv").write_text("case,input,labels\nA,first.nii,labels.nii\n")
+    scan = MeshSettings(device="0", labels=LabelChoice(str(cohort / "labels.nii")))
+    with open_view([cohort / "first.nii"], ViewSettings(scan=scan)) as view, view.session() as session:
+        hidden = next(part["key"] for part in session.facts()["parts"] if part["kind"] == "label")
+        for command in ({"do": "set_mode", "name": "labels"}, {"do": "show", "key": hidden, "visible": False}):
+            session.do(command)
+        session.do({"do": "look", "view": "left"})
+        save(session, cohort / "labelled.view.json")
+    return cohort
+
+
+@pytest.mark.seconds
+def test_picture_of_a_labelled_case_has_the_size_asked_for_and_is_that_of_the_view(
+    labelled: Path, tmp_path: Path
+) -> None:
+    state = ["--state", str(labelled / "labelled.view.json"), "--size", "200x160", "--device", "0", "-q"]
+    seen = ["view", str(labelled / "first.nii"), "--labels", str(labelled / "labels.nii"), *state]
+    assert main([*seen, "--picture", str(tmp_path / "a.png")]) == 0
+
+    output = ["-o", str(tmp_path / "out"), "--hu", "300", "--no-mesh", "--no-measure"]
+    assert main(["batch", str(labelled / "labelled.csv"), *output, *state]) == 0
+
+    picture = tmp_path / "out" / "A" / "picture.png"
+    assert Image.open(picture).size == (200, 160)
+    assert (np.array(Image.open(picture))[..., 3] > 0).mean() > 0.05  # the label that is shown
+    assert picture.read_bytes() == (tmp_path / "a.png").read_bytes()
+
+
 @pytest.mark.seconds
 def test_same_scan_at_another_place_has_the_same_pixels(output: Path) -> None:
     first, second = (np.array(Image.open(output / case / "picture.png")) for case in ("A", "B"))
@@ -117,6 +153,7 @@ REFUSED = {
     "damaged": ({"parts": None}, (), 4, "damaged"),
     "beside a view": ({}, ("--view", "left"), 3, "--view"),
     "without pictures": ({}, ("--no-picture",), 3, "--no-picture"),
+    "picture without a row": ({}, ("--size", "10x0"), 3, "16384"),
 }
 
 
