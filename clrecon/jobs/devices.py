@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import DeviceError
@@ -42,17 +41,13 @@ def survey_devices(name: str | None = None) -> tuple[dict[str, Any], DeviceError
     from clrecon.opencl.select import explain_choice
 
     devices = list_devices()
-    problem: DeviceError | None = None
-    chosen: int | None = None
-    reason: str | None = None
-    warnings: Sequence[str] = cache_warnings()
+    device: Device | None = None
+    reason = problem = None
     try:
-        device = choose_remembered(name)
-        chosen = device.index
-        reason = explain_choice(name)
-        warnings = device.warnings
+        device, reason = choose_remembered(name), explain_choice(name)
     except DeviceError as error:
         problem = error
+    chosen = None if device is None else device.index
     survey = name_schema(
         "devices",
         {
@@ -63,7 +58,7 @@ def survey_devices(name: str | None = None) -> tuple[dict[str, Any], DeviceError
             ],
             "chosen": chosen,
             "reason": reason,
-            "warnings": list(warnings),
+            "warnings": list(cache_warnings() if device is None else device.warnings),
         },
     )
     return survey, problem

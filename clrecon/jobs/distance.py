@@ -224,9 +224,7 @@ def describe_mesh(mesh: Mesh, path: str | Path, quality: MeshQuality) -> dict[st
     closed = quality.closed and quality.oriented
     return {
         "name": escape_text(Path(path).name),
-        "kind": file["kind"],
-        "space": file["space"],
-        "space_from": file["space_from"],
+        **{fact: file[fact] for fact in ("kind", "space", "space_from")},
         "vertices": mesh.vertex_count,
         "triangles": mesh.triangle_count,
         "closed": closed,

@@ -55,7 +55,10 @@ class Bucket:
 
     def list_entries(self, limits: Limits = Limits()) -> list[Entry]:  # noqa: B008 (a tuple)
         with foreign_errors(self._name):
-            return sorted(_as_entry(item) for item in self._find_objects(limits))
+            return sorted(
+                Entry(item["path"], item["size"], f"{item['e_tag']}\0{item['last_modified']}")
+                for item in self._find_objects(limits)
+            )
 
     def _find_objects(self, limits: Limits) -> list[Any]:
         if self._key:
@@ -89,10 +92,6 @@ class Bucket:
         pieces = iter(self._obstore.get(self._store, entry.name).stream(min_chunk_size=_PIECE))
         wanted = iter(lambda: b"" if self._is_ending else next(pieces, b""), b"")
         _write_pieces(wanted, entry, target, self._name)
-
-
-def _as_entry(item: Any) -> Entry:
-    return Entry(item["path"], item["size"], f"{item['e_tag']}\0{item['last_modified']}")
 
 
 class FileSystem:

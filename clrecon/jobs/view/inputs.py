@@ -130,11 +130,16 @@ def _describe_frame(name: str, file: dict[str, Any]) -> tuple[str, ...]:
     return (*turned, *file["warnings"])
 
 
-def _open_mesh(path: str | Path, space: Space | None) -> OpenedInput:
-    mesh = read_side(path, space)
-    name = escape_text(Path(path).name)
+def read_shown_mesh(path: str | Path, space: Space | None) -> tuple[Mesh, str]:
+    """Read a mesh in which there is something to show; return also the name of its file."""
+    mesh, name = read_side(path, space), escape_text(Path(path).name)
     if not mesh.triangle_count:
         raise RefusedInputError(f"{name} has no triangle: there is nothing to show")
+    return mesh, name
+
+
+def _open_mesh(path: str | Path, space: Space | None) -> OpenedInput:
+    mesh, name = read_shown_mesh(path, space)
     return OpenedInput(mesh, _describe_frame(name, mesh.report["file"]), dict(mesh.report["file"]))
 
 

@@ -8,11 +8,11 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from clrecon.errors import RefusedInputError, UsageError
+from clrecon.errors import UsageError
 from clrecon.exchange.page import read_facts
 from clrecon.exchange.page_slices import pack_slices
 from clrecon.geometry import Volume
-from clrecon.jobs.distance import doubt_frames, read_side
+from clrecon.jobs.distance import doubt_frames
 from clrecon.jobs.inputs import may_be_mesh
 from clrecon.jobs.mesh.bone import judge_surfaces
 from clrecon.jobs.mesh.make import label_parts, make_parts
@@ -20,6 +20,7 @@ from clrecon.jobs.options import changed_fields
 from clrecon.jobs.outputs import commit_all
 from clrecon.jobs.run import JobReport, Run
 from clrecon.jobs.view import ViewSettings
+from clrecon.jobs.view.inputs import read_shown_mesh
 from clrecon.mesh import Mesh
 from clrecon.rendering.looks.window import WINDOWS
 from clrecon.rendering.pictures.label_style import distinct_colors
@@ -149,16 +150,11 @@ def _read_input(path: str | Path, settings: ViewSettings, run: Run) -> _ShownInp
 
 
 def _read_mesh(path: str | Path, settings: ViewSettings) -> _ShownInput:
-    mesh = read_side(path, settings.mesh_space)
-    name = escape_text(Path(path).name)
-    if not mesh.triangle_count:
-        raise RefusedInputError(f"{name} has no triangle: there is nothing to show")
+    mesh, name = read_shown_mesh(path, settings.mesh_space)
     file = mesh.report["file"]
     entry = {
         "name": name,
-        "kind": file["kind"],
-        "space": file["space"],
-        "space_from": file["space_from"],
+        **{fact: file[fact] for fact in ("kind", "space", "space_from")},
         "triangles": mesh.triangle_count,
         "volume": None,
         "surface": None,
