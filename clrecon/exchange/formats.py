@@ -40,6 +40,7 @@ class FileFormat:
     `read_mesh` and `read_cloud`, and where a mesh can be written `in_pieces`, `write_pieces`.
 
     most_bytes: Largest file that the format, or common readers of it, can handle.
+    triangle_bytes: At least so many bytes of it are those of each triangle.
     """
 
     module: str
@@ -49,6 +50,7 @@ class FileFormat:
     holds_many: bool = False
     in_pieces: bool = False
     most_bytes: int = NO_LIMIT
+    triangle_bytes: int = 0
 
     @property
     def code(self) -> Any:
@@ -57,10 +59,10 @@ class FileFormat:
 
 # STL: the format could hold more, but many programs keep offsets in 32 bits.  GLB: its length field has 32 bits.
 _REGISTRY = {
-    ".stl": FileFormat(module="stl", meshes=True, in_pieces=True, most_bytes=_FOUR_GIB),
+    ".stl": FileFormat(module="stl", meshes=True, in_pieces=True, most_bytes=_FOUR_GIB, triangle_bytes=50),
     ".ply": FileFormat(module="ply", meshes=True, clouds=True, in_pieces=True),
     ".obj": FileFormat(module="obj", meshes=True, holds_many=True),
-    ".glb": FileFormat(module="glb", meshes=True, holds_many=True, most_bytes=_FOUR_GIB),
+    ".glb": FileFormat(module="glb", meshes=True, holds_many=True, most_bytes=_FOUR_GIB, triangle_bytes=12),
     ".vtp": FileFormat(module="vtp", meshes=True, clouds=True, holds_many=True),
     ".3mf": FileFormat(module="threemf", meshes=True, holds_many=True),
     ".html": FileFormat(module="page", meshes=True, holds_many=True, is_read=False),
@@ -97,18 +99,30 @@ def stage_content(
     """
     code = chosen.code
     expected_bytes = code.estimate(content)
-    if expected_bytes > chosen.most_bytes:
-        kind = os.path.splitext(os.fspath(path))[1][1:].upper()
-        raise OutputError(
-            f"{counted} make a {kind} file of about {expected_bytes / 2**30:.1f} GiB, at most 4 GiB can be"
-            f" read: write {others}"
-        )
+    _check_bytes(expected_bytes, path, chosen, counted, others)
     return stage_file(
         path,
         lambda stream: code.write(stream, content) if pieces is None else code.write_pieces(stream, content, pieces),
         lambda temporary: code.verify(temporary, content),
         expected_bytes=expected_bytes,
     )
+
+
+def _check_bytes(
+    expected_bytes: int, path: str | os.PathLike[str], chosen: FileFormat, counted: str, others: str
+) -> None:
+    if expected_bytes > chosen.most_bytes:
+        kind = os.path.splitext(os.fspath(path))[1][1:].upper()
+        raise OutputError(
+            f"{counted} make a {kind} file of about {expected_bytes / 2**30:.1f} GiB, at most 4 GiB can be"
+            f" read: write {others}"
+        )
+
+
+def check_triangles(count: int, path: str | os.PathLike[str]) -> None:
+    """Refuse a mesh that is certainly too large for its format, before it is measured and written."""
+    chosen = FORMATS[check_format(path)]
+    _check_bytes(count * chosen.triangle_bytes, path, chosen, f"{count} triangles", "PLY or VTP")
 
 
 MOST_PARTS = 20

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from clrecon.errors import UsageError
-from clrecon.exchange.formats import check_assembly, check_in_pieces, describe_rounding
+from clrecon.exchange.formats import check_assembly, check_in_pieces, check_triangles, describe_rounding
 from clrecon.geometry import Volume, frame_from_lps
 from clrecon.jobs.mesh.bone import judge_surfaces, warn_of_walls
 from clrecon.jobs.mesh.labels import describe_label, judge_label_volumes, name_label_files
@@ -305,6 +305,9 @@ def make_mesh(
         paths = [output] * len(parts)
         if not settings.one_file:
             paths = name_outputs(output, [part.name for part in parts], report_path)
+        if not settings.refines:  # which may take triangles away
+            for part, path in zip(parts, paths, strict=True):
+                check_triangles(part.mesh.triangle_count, path)
         is_measured = settings.strict or (report_path is not None if measure is None else measure)
         judge_surfaces(parts, result.volume, settings, partial(label_parts, device=result.device, settings=settings))
         run.lap("select")

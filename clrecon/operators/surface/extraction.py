@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -236,8 +236,11 @@ class Extraction:
         seconds = dict(self.stopwatch.seconds), dict(self.stopwatch.by_kernel)
         return SpanFacts(self.device.label, self.device.driver, self.slabs, self.largest, *seconds, self.warnings)
 
-    def take_spans(self, spans: Sequence[SpanPart]) -> Part:
-        """Join the parts of all spans, in their order, in place of `run`; their indices begin anew, and rise here."""
+    def take_spans(self, spans: Iterable[SpanPart]) -> Part:
+        """Join the parts of all spans, in their order, in place of `run`; their indices begin anew, and rise here.
+
+        Of parts that the caller does not keep, nothing is there twice.
+        """
         self.parts += map(self.take_span, spans)
         if self.vertices == 0:
             raise self.refuse_level()

@@ -63,7 +63,7 @@ def extract_by_spans(
         parts[span] = part
         ready += span[1] - span[0]
         progress("slabs", ready, slices)
-    positions, normals, triangles = run.take_spans([parts.pop(span) for span in spans])
+    positions, normals, triangles = run.take_spans(parts.pop(span) for span in spans)
     report = run.describe(len(positions), len(triangles))
     return Mesh(run.placement.to_lps(positions), triangles, normals, report, trusted=True)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import weakref
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,6 +16,7 @@ from refusals import refused
 from clrecon import SurfaceExtractor, Volume, extract_isosurface
 from clrecon.cli.main import main
 from clrecon.errors import DeviceError, NoSurfaceError, OutputError, UsageError
+from clrecon.exchange.formats import FORMATS, check_triangles
 from clrecon.jobs.mesh.job import make_mesh
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.workers import ClusterSpans
@@ -191,3 +193,28 @@ def test_extractor_keeps_a_file_that_exists_where_it_is_told_to(tmp_path: Path, 
     older.write_bytes(b"older")
     with SurfaceExtractor(make_noise(), device=device) as extractor, refused(OutputError, "no_clobber"):
         extractor.save(older, 50, no_clobber=True)
+
+
+def test_mesh_too_large_for_its_format_is_refused_before_it_is_measured(
+    ct: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(FORMATS, ".stl", replace(FORMATS[".stl"], most_bytes=100_000))
+    stages: list[str] = []
+    with refused(OutputError, "STL", "PLY"):
+        make_mesh(
+            ct, tmp_path / "m.stl", MeshSettings(iso_value=0.0), measure=True,
+            progress=lambda stage, *_: stages.append(stage),
+        )  # fmt: skip
+    assert "build" in stages  # the surface was made
+    assert "measure" not in stages
+    assert "write" not in stages
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("extension", "most"), [(".stl", 85_899_345), (".glb", 357_913_941)], ids=["STL, 50 bytes each", "GLB, 12 each"]
+)
+def test_triangles_alone_tell_that_a_file_has_more_than_four_gib(extension: str, most: int) -> None:
+    check_triangles(most, f"m{extension}")
+    with refused(OutputError, most + 1, "PLY"):
+        check_triangles(most + 1, f"m{extension}")
