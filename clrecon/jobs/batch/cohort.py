@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 import statistics
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -18,7 +19,7 @@ from string import Template
 from typing import Any, BinaryIO
 
 from clrecon.jobs.batch.case import DONE, GATE, LABELS, PICTURE, read_report
-from clrecon.jobs.batch.plan import PAGE, REPORT, TABLE, Case, Plan
+from clrecon.jobs.batch.plan import PAGE, REPORT, TABLE, TABLE_COLUMNS, Case, Plan
 from clrecon.system.files import replace_file
 from clrecon.version import package_version
 
@@ -27,11 +28,6 @@ MISSING = "missing"
 
 _ALL_LABELS = "cohort_labels.csv"
 
-_COLUMNS = (
-    *("case", "status", "error", "slices", "spacing_i_mm", "spacing_j_mm", "spacing_k_mm", "tilt_deg", "iso_value_hu"),
-    *("meshes", "triangles", "components", "area_mm2", "volume_ml", "closed", "gates_failed", "warnings", "outliers"),
-    *("seconds", "peak_memory_bytes", "device"),
-)
 _JUDGED = ("spacing_k_mm", "iso_value_hu", "triangles", "components", "area_mm2", "volume_ml")
 """Columns in which a case can lie far from the others."""
 
@@ -61,8 +57,10 @@ def write_cohort(cases: Sequence[Case], plan: Plan) -> tuple[Counter[str], list[
             if isinstance(row[column], int | float):
                 values.append(row[column])
     bounds = {column: _find_bounds(values) for column, values in figures.items()}
-    replace_file(root / TABLE, lambda stream: _write_rows(stream, _judge_rows(_find_rows(cases, plan), bounds)))
-    replace_file(root / PAGE, lambda stream: _write_page(stream, root, counts))
+    carried = [*cases[0].carried] if cases else []
+    rows = _judge_rows(_find_rows(cases, plan), bounds)
+    replace_file(root / TABLE, lambda stream: _write_rows(stream, rows, carried))
+    replace_file(root / PAGE, lambda stream: _write_page(stream, root, counts, carried))
     if any(case.labels is not None for case in cases):
         replace_file(root / _ALL_LABELS, lambda stream: _join_labels(stream, cases, plan))
     return counts, missing
@@ -72,17 +70,17 @@ def _find_rows(cases: Iterable[Case], plan: Plan) -> Iterator[dict[str, Any]]:
     for case in cases:
         report = read_report(plan.folder_of(case))
         if report is None:
-            yield dict.fromkeys(_COLUMNS) | {"case": case.name, "status": MISSING}
+            yield dict.fromkeys(TABLE_COLUMNS) | {"case": case.name, "status": MISSING, **case.carried}
         else:
-            yield _make_row(report)
+            yield {**_make_row(report), **case.carried}
 
 
 def _make_row(report: Mapping[str, Any]) -> dict[str, Any]:
     mesh, volume = report["mesh"] or {}, report["volume"] or {}
     spacing = volume.get("spacing_mm") or (None, None, None)
     gates = [gate["name"] for gate in (*volume.get("gates", ()), *mesh.get("gates", ())) if gate["ok"] is False]
-    of_mesh = {name: mesh.get(name) for name in _COLUMNS if name in mesh and name != "meshes"}
-    return dict.fromkeys(_COLUMNS) | of_mesh | {
+    of_mesh = {name: mesh.get(name) for name in TABLE_COLUMNS if name in mesh and name != "meshes"}
+    return dict.fromkeys(TABLE_COLUMNS) | of_mesh | {
         "case": report["case"],
         "status": report["status"],
         "error": (report["error"] or {}).get("kind"),
@@ -119,13 +117,23 @@ def _judge_rows(
         yield row | {"outliers": " ".join(far)}
 
 
-def _write_rows(stream: BinaryIO, rows: Iterable[dict[str, Any]]) -> None:
+def _write_rows(stream: BinaryIO, rows: Iterable[dict[str, Any]], carried: Sequence[str]) -> None:
     text = io.TextIOWrapper(stream, encoding="utf-8", newline="", write_through=True)
-    table = csv.DictWriter(text, _COLUMNS, lineterminator="\n")
-    table.writeheader()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow((*TABLE_COLUMNS, *map(_defuse, carried)))
     for row in rows:
-        table.writerow({name: round(cell, 6) if isinstance(cell, float) else cell for name, cell in row.items()})
+        figures = (row[column] for column in TABLE_COLUMNS)
+        cells = (round(cell, 6) if isinstance(cell, float) else cell for cell in figures)
+        table.writerow((*cells, *(_defuse(row[column]) for column in carried)))
     text.detach()
+
+
+_FORMULA = re.compile(r"[=@\t\r]|[+-](?![\d.,]+(e[+-]?\d+)?$)", re.IGNORECASE)
+
+
+def _defuse(cell: str) -> str:
+    """Return a cell of a manifest that spreadsheets show as text, where they would run it as a formula."""
+    return f"'{cell}" if _FORMULA.match(cell) else cell
 
 
 def _join_labels(stream: BinaryIO, cases: Iterable[Case], plan: Plan) -> None:
@@ -156,7 +164,7 @@ _SHOWN: tuple[tuple[str, str, Callable[[str], str]], ...] = (
 """Columns of the page: that of the table, its heading, and how its cells are written."""
 
 
-def _write_page(stream: BinaryIO, root: Path, counts: Counter[str]) -> None:
+def _write_page(stream: BinaryIO, root: Path, counts: Counter[str], carried: Sequence[str]) -> None:
     """Write the page from the table, row by row; pictures are files beside it, loaded when they come into view."""
     text = (files(__package__) / PAGE).read_text(encoding="utf-8")
     total = sum(counts.values())
@@ -164,18 +172,18 @@ def _write_page(stream: BinaryIO, root: Path, counts: Counter[str]) -> None:
     page = Template(text).substitute(
         version=escape(package_version()),
         lead=escape(f"{total:,} case{'s' * (total != 1)}: {counted}"),
-        heads="".join(f"<th>{escape(heading)}</th>" for _, heading, _ in _SHOWN),
+        heads="".join(f"<th>{escape(heading)}</th>" for heading in (*(shown for _, shown, _ in _SHOWN), *carried)),
         rows="\0",
     )
     head, _, end = page.partition("\0")
     stream.write(head.encode())
     with open(root / TABLE, newline="", encoding="utf-8") as table:
         for row in csv.DictReader(table):
-            stream.write(_lay_out_row(row, root).encode())
+            stream.write(_lay_out_row(row, root, carried).encode())
     stream.write(end.encode())
 
 
-def _lay_out_row(row: Mapping[str, str], root: Path) -> str:
+def _lay_out_row(row: Mapping[str, str], root: Path, carried: Iterable[str]) -> str:
     case, status = escape(row["case"]), escape(row["status"])
     folder, far = root / row["case"], row["outliers"].split()
     pictures = sorted(folder.glob(PICTURE.replace(".", "*.")))
@@ -190,4 +198,5 @@ def _lay_out_row(row: Mapping[str, str], root: Path) -> str:
         mark = ' class="far" title="far from the other cases"' if column in far else ""
         cell = row[column]
         cells.append(f'<td data-value="{escape(cell)}"{mark}>{escape(write(cell)) if cell else ""}</td>')
+    cells += (f"<td>{escape(row[_defuse(column)])}</td>" for column in carried)
     return f"<tr>{''.join(cells)}</tr>\n"

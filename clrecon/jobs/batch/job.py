@@ -19,6 +19,7 @@ from clrecon.system.arguments import name_parameter
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.paths import resolve_target, shown_path, system_errors
 from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.text import escape_text
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -59,6 +60,9 @@ def run_batch(
     _check_choice(plan)
     check_places(cases, plan.output)
     root = _open_output(plan, cases)
+    if cases and cases[0].carried:
+        columns = ", ".join(map(escape_text, cases[0].carried))
+        warn(f"no options, but carried into {TABLE}: the columns {columns}")
     chosen = list(cases) if asked.part is None else list(cases[asked.part[0] - 1 :: asked.part[1]])
     counts: Counter[str] = Counter()
     kept_count = made_count = 0

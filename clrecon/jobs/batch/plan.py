@@ -9,6 +9,7 @@ import json
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from difflib import get_close_matches
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
@@ -37,7 +38,7 @@ from clrecon.system.options import option, options_of, pick_fields, read_cell
 from clrecon.system.packages import import_package
 from clrecon.system.paths import open_regular, shown_path
 from clrecon.system.progress import DEFAULT_SECONDS
-from clrecon.system.text import escape_text, guess_word, unknown_name
+from clrecon.system.text import escape_text, unknown_name
 from clrecon.version import package_version
 
 _MOST_WORKERS = 256
@@ -206,12 +207,17 @@ class BatchSettings:
 
 
 class Case(NamedTuple):
-    """A row of a manifest, or a series of a folder; `cells` are options of its own, each a pair of name and text."""
+    """A row of a manifest, or a series of a folder.
+
+    cells: Options of its own, each a pair of name and text.
+    carried: Cells of the columns that are no options, which the table of the cohort takes over.
+    """
 
     name: str
     source: str
     labels: str | None = None
     cells: Sequence[Sequence[str]] = ()
+    carried: Mapping[str, str] = {}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -327,6 +333,17 @@ _LEVELS = {own.name for own in options_of(MeshSettings, "level")}
 
 COLUMNS = ("case", "input", "labels")
 
+TABLE_COLUMNS = (
+    *("case", "status", "error", "slices", "spacing_i_mm", "spacing_j_mm", "spacing_k_mm", "tilt_deg", "iso_value_hu"),
+    *("meshes", "triangles", "components", "area_mm2", "volume_ml", "closed", "gates_failed", "warnings", "outliers"),
+    *("seconds", "peak_memory_bytes", "device"),
+)
+"""Columns of the table of the cohort, before those that a manifest has beside its options."""
+
+_OF_THE_BATCH = {own.flags[0].removeprefix("--") for own in options_of(BatchSettings, None)} | {"device", "memory"}
+_CLOSE = 0.8
+"""Likeness of words (`difflib`) from which on a column counts as a misspelt option, not as one to be carried."""
+
 
 def _read_cells(case: Case) -> dict[str, Any]:
     """Return the values of a case's own options, by the names of fields."""
@@ -399,16 +416,14 @@ def _write_cell(cell: Any) -> str:
 
 
 def _find_columns(name: str, header: Sequence[str]) -> dict[str, int]:
-    """Return the place of each column, by the first line of a table."""
-    words = [word.strip().lower().removeprefix("--").replace("_", "-") for word in header]
+    """Return the place of each column, by the first line of a table; those that are carried keep their spelling."""
     known = (*COLUMNS, *_OPTIONS)
-    unknown = [word for word in words if word not in known]
-    if unknown:
-        shown = ", ".join(f"{word!r:.60}{guess_word(word, known)}" for word in unknown[:5])
-        raise UsageError(
-            f"the manifest {name} has unknown columns: {shown}; there are {', '.join(COLUMNS)} and options of"
-            " the command without their dashes, such as hu or keep-largest"
-        )
+    words = [word.strip().lower().removeprefix("--").replace("_", "-") for word in header]
+    words = [word if word in known else given.strip() for word, given in zip(words, header, strict=True)]
+    for word in words:
+        reason = None if word in known else _refuse_column(word.lower().replace("_", "-"), known)
+        if reason:
+            raise UsageError(f"the column {word!r:.60} of the manifest {name} {reason}")
     missing = [word for word in COLUMNS[:2] if word not in words]
     twice = [word for word in words if words.count(word) > 1]
     if missing or twice:
@@ -417,9 +432,24 @@ def _find_columns(name: str, header: Sequence[str]) -> dict[str, int]:
     return {word: place for place, word in enumerate(words)}
 
 
+def _refuse_column(word: str, known: Sequence[str]) -> str | None:
+    """Return why a column of the table of the cohort cannot have this name; None if it can."""
+    misspelt = get_close_matches(word, known, n=1, cutoff=_CLOSE)
+    if not word.strip():
+        return "has no name"
+    if word in _OF_THE_BATCH:
+        return "is an option of the whole batch, not of a case: give it to the command"
+    if word in (column.replace("_", "-") for column in TABLE_COLUMNS):
+        return f"has the name of one of the columns of {TABLE}: rename it"
+    if misspelt:
+        return f"is no option (did you mean {misspelt[0]}?); to carry it into {TABLE}, rename it"
+    return None
+
+
 def _read_rows(
     name: str, rows: Iterable[tuple[int, Sequence[str]]], places: dict[str, int], folder: str, plan: Plan
 ) -> list[Case]:
+    known = {*COLUMNS, *_OPTIONS}
     lines: dict[str, int] = {}
     checked: dict[tuple[bool, Any], Any] = {}
     cases: list[Case] = []
@@ -454,7 +484,8 @@ def _read_rows(
         except UsageError as error:
             raise UsageError(f"line {line} of the manifest {name}: {error}") from None
         options = checked.setdefault((labels is None, options), options)  # one for all equal ones
-        cases.append(Case(case, source or "", labels, options))
+        carried = {column: cell for column, cell in cells.items() if column not in known}
+        cases.append(Case(case, source or "", labels, options, carried))
     return cases
 
 

@@ -113,7 +113,10 @@ def test_key_of_a_case_changes_with_the_file_of_its_region_which_lies_beside_the
 
 
 BAD_TABLES = {
-    "unknown columns": ("case,input,age,keep_largst\na,b,1,2\n", ("age", "keep-largst", "keep-largest")),
+    "a misspelt option": ("case,input,age,keep_largst\na,b,1,2\n", ("keep_largst", "keep-largest")),
+    "an option of the batch": ("case,input,workers\na,b,1\n", ("workers", "batch")),
+    "a column of the table": ("case,input,area_mm2\na,b,1\n", ("area_mm2", "cohort.csv", "rename")),
+    "a column without a name": ("case,input,\na,b,1\n", ("name",)),
     "a column in two spellings": ("case,input,keep_largest,keep-largest\na,x,1,1\n", ("keep-largest", "twice")),
     "no number": ("case,input,hu\na,x,300\nb,x,bone\n", (3, "hu", "bone")),
     "no whole number": ("case,input,keep_largest\na,x,1.5\n", (2, "keep-largest", "1.5")),

@@ -123,3 +123,38 @@ def test_page_of_a_cohort_loads_nothing_from_outside_and_has_no_faults_in_the_co
     click_on(page_driver, "case")
     assert outside_requests(page_driver) == []
     assert severe_lines(page_driver) == []
+
+
+@pytest.fixture
+def carried(tmp_path: Path) -> Path:
+    """A cohort whose manifest has an age, words with tags and quotes, and cells that spreadsheets would run."""
+    output = tmp_path / "out"
+    (output / "b").mkdir(parents=True)
+    (output / "b" / "case.json").write_text(json.dumps(make_report("b", volume_ml=100.0, gates=[])))
+    rows = ['b,ct,63,"<b>x</b>, ""y""",=1+1', "gone,ct,-5,Ö,+4917", "last,ct,,@a,-2.5e3"]
+    (tmp_path / "m.csv").write_text("\n".join(["case,input,Age,my_Group,=note", *rows]), encoding="utf-8")
+    assert main(["batch", str(tmp_path / "m.csv"), "-o", str(output), "--collect", "-q"]) == SOME_CASES_NOT_DONE
+    return output
+
+
+def test_other_columns_of_the_manifest_are_carried_into_the_table(carried: Path) -> None:
+    rows = read_rows(carried)
+    assert list(rows["b"])[-3:-1] == ["Age", "my_Group"]
+    assert [(row["Age"], row["my_Group"]) for row in rows.values()] == [
+        ("63", '<b>x</b>, "y"'), ("-5", "Ö"), ("", "'@a"),
+    ]  # fmt: skip
+    assert float(rows["b"]["volume_ml"]) == 100.0
+
+
+def test_cells_that_spreadsheets_would_run_as_formulas_become_text(carried: Path) -> None:
+    rows = read_rows(carried)
+    assert list(rows["b"])[-1] == "'=note"
+    assert [row["'=note"] for row in rows.values()] == ["'=1+1", "+4917", "-2.5e3"]  # signed numbers stay
+
+
+def test_carried_cells_are_escaped_on_the_page(carried: Path) -> None:
+    page = (carried / "cohort.html").read_text(encoding="utf-8")
+    PageCheck(page)
+    assert "<b>x</b>" not in page
+    assert "<td>&lt;b&gt;x&lt;/b&gt;, &quot;y&quot;</td>" in page
+    assert "<th>my_Group</th>" in page
