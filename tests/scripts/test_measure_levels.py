@@ -17,6 +17,7 @@ from clrecon.mesh import Mesh
 import level_peers  # isort: skip
 import level_phantoms  # isort: skip
 import marked_tables  # isort: skip
+import measure_corridors  # isort: skip
 import measure_levels  # isort: skip
 import measure_reconstructions  # isort: skip
 
@@ -29,10 +30,12 @@ def test_page_of_iso_values_has_the_table_of_the_recorded_figures(name: str) -> 
     assert marked_tables.find_table(PAGE, name) == measure_levels.tables()[name]
 
 
-def test_page_of_iso_values_has_the_reconstructions_that_were_measured() -> None:
-    figures = json.loads(measure_reconstructions.FIGURES.read_text(encoding="utf-8"))
-    table = marked_tables.find_table(PAGE, measure_reconstructions.TABLE)
-    assert table == measure_reconstructions.make_table(figures)
+@pytest.mark.parametrize("measure", [measure_reconstructions, measure_corridors], ids=lambda module: module.TABLE)
+def test_page_has_the_table_that_was_measured(measure: Any) -> None:
+    figures = json.loads(measure.FIGURES.read_text(encoding="utf-8"))
+    assert marked_tables.find_table(measure.PAGE.read_text(encoding="utf-8"), measure.TABLE) == measure.make_table(
+        figures
+    )
 
 
 BIASES = [one["preset"]["bias_mm"] for one in FIGURES if one["group"] not in level_phantoms.NOT_IN_TISSUE]

@@ -51,11 +51,11 @@ FARTHEST = 8.0
 
 _THICK_SHARE = 0.5
 _CORTEX_STEP = 1.03
-_CLEARLY_LESS, _LESS = 0.97, 0.98
+_CLEARLY_LESS = 0.97
 """Where this share of the walls is thick, the cortex is what leaves least of the profiles, in steps of the second from
 what they show on, down as long as less than the third of it is left: their percentile holds noise, which the blurs
-follow, and it them (11 % too much at 40 HU).  Then up, as below, as long as less than the last share is left: vessels
-with contrast medium that count as thick walls are less dense (840 HU for 945)."""
+follow, and it them (11 % too much at 40 HU).  Then up, in steps as below, by the same rule: vessels with contrast
+medium that count as thick walls are less dense (838 HU for 907)."""
 
 _UPWARD_STEP, _UPWARD_STEPS = 1.04, 8
 _ALMOST, _STILL_THICK = 1.02, 0.25
@@ -308,14 +308,14 @@ def _search(walls: _Walls, volume: Volume) -> tuple[_Trial, int]:
         cortex_hu, thick = _measure_cortex(walls, slice(None), best)
     if not shown:
         return _search_upwards(walls, best._replace(cortex_hu=cortex_hu)), thick
-    best = _step_cortex(walls, best, 1.0 / _CORTEX_STEP, _CLEARLY_LESS)
-    return _step_cortex(walls, best, _UPWARD_STEP, _LESS) if _may_be_denser(walls, best) else best, thick
+    best = _step_cortex(walls, best, 1.0 / _CORTEX_STEP)
+    return _step_cortex(walls, best, _UPWARD_STEP) if _may_be_denser(walls, best) else best, thick
 
 
-def _step_cortex(walls: _Walls, best: _Trial, step: float, less: float) -> _Trial:
-    """Return a trial whose cortex was changed by steps as long as each leaves less than this share."""
+def _step_cortex(walls: _Walls, best: _Trial, step: float) -> _Trial:
+    """Return a trial whose cortex was changed by steps as long as each leaves clearly less."""
     candidate = best
-    while candidate is best or _left(walls, slice(None), candidate) < less * _left(walls, slice(None), best):
+    while candidate is best or _left(walls, slice(None), candidate) < _CLEARLY_LESS * _left(walls, slice(None), best):
         best = candidate
         candidate = best._replace(cortex_hu=best.cortex_hu * step)
         candidate = _search_blurs(walls, slice(None), candidate, SEARCH_STEPS[2:])
