@@ -14,8 +14,11 @@ from numpy.typing import NDArray
 from clrecon.mesh.triangles import cross_product
 from clrecon.system.pieces import find_bounds, in_threads
 
-_LEAF, _FAN = 4, 8
+_LEAF, _FAN = 2, 8
 """Triangles in a leaf, and boxes in a node."""
+
+_STARTS = 3
+"""Leaves beside a point on the curve that are looked at first: with three a fifth as many are near as with one."""
 
 _MANY = 8
 """Boxes for each point from which on it pays to ask in which of them the surface surely is near."""
@@ -98,9 +101,19 @@ class TriangleTree:
         return np.where(np.isinf(shares), np.nan, shares)[:, None] * (ends - starts) + starts
 
     def _find_nearest(self, points: Points) -> tuple[Points, NDArray[np.int64], NDArray[np.float64]]:
-        columns, every = np.ascontiguousarray(points.T), np.arange(len(points))
-        start = np.maximum(np.searchsorted(self._firsts, self._curve.codes(2.0 * columns), side="right") - 1, 0)
-        nearest = self._measure(columns, every, start)
+        columns, count = np.ascontiguousarray(points.T), len(points)
+        nearest = np.empty((count, 3)), np.empty(count, np.int64), np.full(count, np.inf)
+
+        def look_at(items: NDArray[np.intp], leaves: NDArray[np.intp]) -> None:
+            candidates = self._measure(columns[:, items], leaves)
+            here, best = _least_of(items, candidates[2])
+            nearer = candidates[2][best] < nearest[2][here]
+            for values, others in zip(nearest, candidates, strict=True):
+                values[here[nearer]] = others[best[nearer]]
+
+        ahead = np.searchsorted(self._firsts, self._curve.codes(2.0 * columns), side="right")
+        starts = np.clip(ahead[:, None] - np.arange(_STARTS), 0, len(self._rows) - 1)
+        look_at(np.arange(count).repeat(_STARTS), starts.ravel())
         pairs = self._descend(
             lambda items, boxes: _squares_to_boxes(columns[:, items], boxes),
             nearest[2].copy(),
@@ -111,18 +124,12 @@ class TriangleTree:
             places, rows, squares = (np.concatenate(both) for both in zip(*halves, strict=True))
             return places, rows, squares
         items, leaves, bounds = pairs
-        for some in (_least_of(items, bounds)[1], slice(None)):  # the nearest box of each first: it rules out others
-            near = bounds[some] < nearest[2][items[some]]
-            here = items[some][near]
-            candidates = self._measure(columns[:, here], here, leaves[some][near])
-            here, best = _least_of(here, candidates[2])
-            nearer = candidates[2][best] < nearest[2][here]
-            for values, others in zip(nearest, candidates, strict=True):
-                values[here[nearer]] = others[best[nearer]]
+        near = bounds < nearest[2][items]
+        look_at(items[near], leaves[near])
         return nearest
 
     def _measure(
-        self, columns: Columns, items: NDArray[np.intp], leaves: NDArray[np.intp]
+        self, columns: Columns, leaves: NDArray[np.intp]
     ) -> tuple[Points, NDArray[np.int64], NDArray[np.float64]]:
         """Return the places nearest to points on the triangles of one leaf each, with rows and squares."""
         rows = self._rows[leaves].reshape(-1)
