@@ -15,6 +15,19 @@
 #define LANES 16
 #endif
 
+#if LANES >= 8
+static inline int any_lane(const int8 condition)
+{
+#ifdef __AVX__
+    return __builtin_ia32_movmskps256(as_float8(condition)) != 0;
+#else
+    const int4 half_way = condition.lo | condition.hi;
+    const int2 quarter = half_way.lo | half_way.hi;
+    return (quarter.x | quarter.y) != 0;
+#endif
+}
+#endif
+
 #if LANES == 16
 typedef float16 floats;
 typedef int16 ints;
@@ -24,6 +37,7 @@ typedef int16 ints;
 #define as_ints as_int16
 #define load_lanes(pointer) vload16(0, pointer)
 #define store_lanes(vector, pointer) vstore16(vector, 0, pointer)
+#define ANY_LANE(condition) any_lane((condition).lo | (condition).hi)
 #elif LANES == 8
 typedef float8 floats;
 typedef int8 ints;
@@ -37,16 +51,6 @@ typedef int8 ints;
 #define FIRST_LANE(vector) ((vector).s0)
 #define ANY_LANE(condition) any_lane(condition)
 #define LEAST_LANE(vector) least_lane(vector)
-static inline int any_lane(const int8 condition)
-{
-#ifdef __AVX__
-    return __builtin_ia32_movmskps256(as_float8(condition)) != 0;
-#else
-    const int4 half_way = condition.lo | condition.hi;
-    const int2 quarter = half_way.lo | half_way.hi;
-    return (quarter.x | quarter.y) != 0;
-#endif
-}
 static inline float least_lane(const float8 v)
 {
     const float4 half_way = v.lo < v.hi ? v.lo : v.hi;

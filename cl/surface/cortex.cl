@@ -35,95 +35,160 @@
 #define FRAME 2 /* rows: square of the normal's part across the slices, square of the gap there */
 #define ROWS 54 /* of a profile: its samples, its frame, and three by three what interpolation adds to their blur */
 
-/* The value between four voxels of a slice. */
-static inline float between_voxels(
-    __global const VOXEL *voxels, const int next, const int across, const float fi, const float fj)
+static inline floats between_lanes(const floats value, const floats low, const floats high)
 {
-    const float a = (float)voxels[0], b = (float)voxels[across];
-    const float below = a + fi * ((float)voxels[next] - a), above = b + fi * ((float)voxels[across + next] - b);
+    return lesser(greater(value, low), high);
+}
+
+/* Values between four voxels of a slice each, of which the first lie at these indices. */
+static inline floats between_voxels(
+    __global const VOXEL *voxels, const size_t *at, const int next, const int across, const floats fi, const floats fj)
+{
+    float a[LANES], b[LANES], c[LANES], d[LANES];
+    for (int lane = 0; lane < LANES; ++lane) {
+        __global const VOXEL *first = voxels + at[lane];
+        a[lane] = (float)first[0], b[lane] = (float)first[next];
+        c[lane] = (float)first[across], d[lane] = (float)first[across + next];
+    }
+    const floats low = load_lanes(a), high = load_lanes(c);
+    const floats below = low + fi * (load_lanes(b) - low), above = high + fi * (load_lanes(d) - high);
     return below + fj * (above - below);
 }
 
-/* What linear interpolation at a share of the way between two voxels, which lie step mm apart along a profile, adds to the
- * blur there: variance beyond the mean over all shares, a sixth of the third cumulant, a 24th of the fourth. */
-static inline float3 series_of(const float share, const float step)
+/* What interpolation adds to the blur: variance, a sixth of the third cumulant, a 24th of the fourth. */
+typedef struct { floats second, third, fourth; } series;
+
+/* Adds what linear interpolation at a share of the way between two voxels, which lie step mm apart along a profile, adds to
+ * the blur there: variance is beyond the mean over all shares. */
+static inline series add_series(const series before, const floats share, const floats step)
 {
-    const float spread = share * (1.0f - share), square = step * step;
-    return (float3)(square * (spread - MEAN_SPREAD), square * step * spread * (2.0f * share - 1.0f) * (1.0f / 6.0f),
-        square * square * spread * (1.0f - 6.0f * spread) * (1.0f / 24.0f));
+    const floats spread = share * (1.0f - share), square = step * step;
+    const series sum = {before.second + square * (spread - MEAN_SPREAD),
+        before.third + square * step * spread * (2.0f * share - 1.0f) * (1.0f / 6.0f),
+        before.fourth + square * square * spread * (1.0f - 6.0f * spread) * (1.0f / 24.0f)};
+    return sum;
+}
+
+/* Of LANES places the slices below and above: what x and y are counted from, heights, 1 / the height between them. */
+typedef struct {
+    float low_x[LANES], low_y[LANES], low_z[LANES], per_mm[LANES], up_x[LANES], up_y[LANES], up_z[LANES];
+} slice_pairs;
+
+/* Fills the pairs of these layers; returns 1 or -1 where the layer at a height lies beyond, in that direction. */
+static inline ints look_up_slices(
+    __global const float4 *slices, const int nk, const ints layers, const floats height, slice_pairs *pairs)
+{
+    int names[LANES];
+    store_lanes(layers, names);
+    for (int lane = 0; lane < LANES; ++lane) {
+        const float4 below = slices[names[lane]], above = slices[min(names[lane] + 1, nk - 1)];
+        pairs->low_x[lane] = below.x, pairs->low_y[lane] = below.y, pairs->low_z[lane] = below.z;
+        pairs->up_x[lane] = above.x, pairs->up_y[lane] = above.y, pairs->up_z[lane] = above.z;
+        pairs->per_mm[lane] = below.w;
+    }
+    return choose((layers < max(nk - 2, 0)) & (height >= load_lanes(pairs->up_z)), (ints)(1), (ints)(0))
+        - choose((layers > 0) & (height < load_lanes(pairs->low_z)), (ints)(1), (ints)(0));
 }
 
 /* Parameters  voxels      in   the slices first_k and following of a volume of (nk, nj, ni)
  *             slices      in   (nk) x y: what i and j are counted from in the slice, in the steps of slice 0; z: its height,
  *                              mm; w: 1 / height to the next slice, 0 for the last
- *             places      in   (count) i and j in slice 0, height in mm; w: number of the slice at or below
- *             directions  in   (count) the same three per mm along the outward normal
+ *             places      in   (4, stride) i and j in slice 0, height in mm, number of the slice at or below
+ *             directions  in   (3, stride) the first three per mm along the outward normal
  *             profiles    out  (ROWS, stride) HU at first_mm + n * step_mm, NaN beyond the volume; square of the normal's
- *                              part across the slices; square of the gap there, in units of usual_gap; and see series_of
+ *                              part across the slices; square of the gap there, in units of usual_gap; and see series
  *             i_square j_square  squares of the steps between voxels in a slice, mm2
  *             known_k     1, or 0 where what interpolation between slices adds is its mean alone
  *             ni nj nk, first_k
- * Launch      global = count rounded up by the host, any local
- * Assumes     all slices that a profile meets are there; with CUBIC one more on either side
+ * Launch      global = count / LANES rounded up by the host, any local
+ * Assumes     stride is a multiple of LANES, with a place in each column; all slices that a profile meets are there; with
+ *             CUBIC one more on either side
  * Guarantees  every row of every place is written */
 __kernel void sample_profiles(
     __global const VOXEL *restrict voxels, __global const float4 *restrict slices,
-    __global const float4 *restrict places, __global const float4 *restrict directions,
+    __global const float *restrict places, __global const float *restrict directions,
     __global float *restrict profiles, const int ni, const int nj, const int nk, const int first_k,
     const float first_mm, const float step_mm, const float usual_gap, const float i_square, const float j_square,
     const float known_k, const uint stride, const uint count)
 {
-    const uint item = get_global_id(0);
+    const size_t item = LANES * get_global_id(0), row = stride, slice = (size_t)ni * (size_t)nj;
     if (item >= count)
         return;
-    const float4 place = places[item], direction = directions[item];
-    int layer = (int)place.w;
-    const int last = max(nk - 2, 0);
-    const float gap = nk > 1 ? 1.0f / (slices[layer].w * usual_gap) : 1.0f;
-    profiles[(size_t)SAMPLES * stride + item] = direction.z * direction.z;
-    profiles[(size_t)(SAMPLES + 1) * stride + item] = gap * gap;
+    __global const float *place = places + item, *direction = directions + item;
+    const floats start_x = load_lanes(place), start_y = load_lanes(place + row), start_z = load_lanes(place + 2 * row);
+    const floats to_x = load_lanes(direction), to_y = load_lanes(direction + row), to_z = load_lanes(direction + 2 * row);
+    __global float *profile = profiles + item;
+    const floats along_i = i_square * to_x, along_j = j_square * to_y;
+    const int last = max(nk - 2, 0), next = ni > 1, across = nj > 1 ? ni : 0;
+    ints layers = to_ints(load_lanes(place + 3 * row));
+    size_t at[LANES];
+    slice_pairs between;
+    look_up_slices(slices, nk, layers, start_z, &between);
+    const floats gap = nk > 1 ? 1.0f / (load_lanes(between.per_mm) * usual_gap) : (floats)(1.0f);
+    store_lanes(to_z * to_z, profile + SAMPLES * row);
+    store_lanes(gap * gap, profile + (SAMPLES + 1) * row);
     for (int n = 0; n < SAMPLES; ++n) {
-        const float4 at = place + (first_mm + (float)n * step_mm) * direction;
-        while (layer < last && at.z >= slices[layer + 1].z)
-            ++layer;
-        while (layer > 0 && at.z < slices[layer].z)
-            --layer;
-        const float4 below = slices[layer], above = slices[min(layer + 1, nk - 1)];
-        const float part = (at.z - below.z) * below.w;
-        const float i = at.x - (below.x + part * (above.x - below.x)), j = at.y - (below.y + part * (above.y - below.y));
-        const int is_within = i >= -0.5f && i <= (float)ni - 0.5f && j >= -0.5f && j <= (float)nj - 0.5f
-            && part >= -0.5f && part <= 1.5f;
-        const float ci = clamp(i, 0.0f, (float)(ni - 1)), cj = clamp(j, 0.0f, (float)(nj - 1));
-        const int li = min((int)ci, max(ni - 2, 0)), lj = min((int)cj, max(nj - 2, 0));
-        const float fi = ci - (float)li, fj = cj - (float)lj, fk = clamp(part, 0.0f, 1.0f);
-        const int next = li + 1 < ni, across = lj + 1 < nj ? ni : 0;
-        __global const VOXEL *low = voxels + voxel_index(li, lj, layer - first_k, ni, nj);
-        __global const VOXEL *high = nk > 1 ? low + (size_t)ni * (size_t)nj : low;
-        const float under = between_voxels(low, next, across, fi, fj);
-        const float over = between_voxels(high, next, across, fi, fj);
-        float value = under + fk * (over - under);
-#ifdef CUBIC
-        if (layer > 0 && layer + 2 < nk
-            && fabs(slices[layer - 1].w - below.w) <= 0.01f * below.w && fabs(above.w - below.w) <= 0.01f * below.w) {
-            value = 0.0f;
-            for (int m = -1; m < 3; ++m) {
-                const float d = fabs(fk - (float)m);
-                const float near = ((SHARPNESS + 2.0f) * d - (SHARPNESS + 3.0f)) * d * d + 1.0f;
-                const float far = SHARPNESS * (((d - 5.0f) * d + 8.0f) * d - 4.0f);
-                value += (d < 1.0f ? near : far)
-                    * between_voxels(voxels + voxel_index(li, lj, layer + m - first_k, ni, nj), next, across, fi, fj);
-            }
+        const float away = first_mm + (float)n * step_mm;
+        const floats x = start_x + away * to_x, y = start_y + away * to_y, z = start_z + away * to_z;
+        /* Between even slices the layer is known at once; else it is looked for from there. */
+        const floats steps = (z - load_lanes(between.low_z)) * load_lanes(between.per_mm);
+        const ints guess = layers + to_ints(steps) - choose(steps < 0.0f, (ints)(1), (ints)(0));
+        layers = lesser_int(greater_int(guess, (ints)(0)), (ints)(last));
+        ints change = look_up_slices(slices, nk, layers, z, &between);
+        while (ANY_LANE(change != 0)) {
+            layers += change;
+            change = look_up_slices(slices, nk, layers, z, &between);
         }
+        const floats low_x = load_lanes(between.low_x), low_y = load_lanes(between.low_y);
+        const floats low_z = load_lanes(between.low_z), per_mm = load_lanes(between.per_mm);
+        const floats over_x = load_lanes(between.up_x) - low_x, over_y = load_lanes(between.up_y) - low_y;
+        const floats over_z = load_lanes(between.up_z) - low_z;
+        const floats part = (z - low_z) * per_mm;
+        const floats i = x - (low_x + part * over_x), j = y - (low_y + part * over_y);
+        const ints is_within = (i >= -0.5f) & (i <= (float)ni - 0.5f) & (j >= -0.5f) & (j <= (float)nj - 0.5f)
+            & (part >= -0.5f) & (part <= 1.5f);
+        const floats ci = between_lanes(i, (floats)(0.0f), (floats)((float)(ni - 1)));
+        const floats cj = between_lanes(j, (floats)(0.0f), (floats)((float)(nj - 1)));
+        const ints li = lesser_int(to_ints(ci), (ints)(max(ni - 2, 0))), lj = lesser_int(to_ints(cj), (ints)(max(nj - 2, 0)));
+        const floats fi = ci - to_floats(li), fj = cj - to_floats(lj);
+        const floats fk = between_lanes(part, (floats)(0.0f), (floats)(1.0f));
+        int columns[LANES], lines[LANES], names[LANES];
+        store_lanes(layers, names);
+        store_lanes(li, columns);
+        store_lanes(lj, lines);
+        for (int lane = 0; lane < LANES; ++lane)
+            at[lane] = voxel_index(columns[lane], lines[lane], names[lane] - first_k, ni, nj);
+        const floats under = between_voxels(voxels, at, next, across, fi, fj);
+        const floats over = between_voxels(voxels + (nk > 1 ? slice : 0), at, next, across, fi, fj);
+        floats value = under + fk * (over - under);
+#ifdef CUBIC
+        int even[LANES];
+        for (int lane = 0; lane < LANES; ++lane) {
+            const int layer = names[lane];
+            const float own = between.per_mm[lane], least = 0.01f * own;
+            even[lane] = layer > 0 && layer + 2 < nk && fabs(slices[layer - 1].w - own) <= least
+                && fabs(slices[layer + 1].w - own) <= least;
+            at[lane] -= even[lane] ? slice : 0;
+        }
+        floats cubic = (floats)(0.0f);
+        for (int m = -1; m < 3; ++m) {
+            const floats d = fabs(fk - (float)m);
+            const floats near = ((SHARPNESS + 2.0f) * d - (SHARPNESS + 3.0f)) * d * d + 1.0f;
+            const floats far = SHARPNESS * (((d - 5.0f) * d + 8.0f) * d - 4.0f);
+            cubic += choose(d < 1.0f, near, far) * between_voxels(voxels, at, next, across, fi, fj);
+            for (int lane = 0; lane < LANES; ++lane)
+                at[lane] += even[lane] ? slice : 0;
+        }
+        value = choose(load_lanes(even) != 0, cubic, value);
 #endif
-        profiles[(size_t)n * stride + item] = is_within ? value : NAN;
-        const float along_i = i_square * direction.x, along_j = j_square * direction.y;
-        const float along_k = known_k
-            * ((above.x - below.x) * along_i + (above.y - below.y) * along_j + (above.z - below.z) * direction.z);
-        const float3 series = series_of(fi, along_i) + series_of(fj, along_j) + series_of(fk, along_k);
-        __global float *more = profiles + (size_t)(SAMPLES + FRAME + n) * stride + item;
-        more[0] = series.x;
-        more[(size_t)SAMPLES * stride] = series.y;
-        more[2 * (size_t)SAMPLES * stride] = series.z;
+        store_lanes(choose(is_within, value, (floats)(NAN)), profile + n * row);
+        const floats along_k = known_k * (over_x * along_i + over_y * along_j + over_z * to_z);
+        const series none = {(floats)(0.0f), (floats)(0.0f), (floats)(0.0f)};
+        const series sum = add_series(add_series(add_series(none, fi, along_i), fj, along_j), fk, along_k);
+        __global float *more = profile + (SAMPLES + FRAME + n) * row;
+        store_lanes(sum.second, more);
+        store_lanes(sum.third, more + SAMPLES * row);
+        store_lanes(sum.fourth, more + 2 * SAMPLES * row);
     }
 }
 
@@ -251,11 +316,6 @@ static inline __attribute__((always_inline)) wall_fit fit_plateaus(const wall_pr
     f.to_x = u * left_p - v * left_q;
     f.to_t = v * left_q;
     return f;
-}
-
-static inline floats between_lanes(const floats value, const floats low, const floats high)
-{
-    return lesser(greater(value, low), high);
 }
 
 static inline wall_fit choose_fit(const ints take, const wall_fit a, const wall_fit b)

@@ -132,10 +132,13 @@ def find_used(numbers: IntArray, size: int) -> IntArray:
     return np.flatnonzero(used)
 
 
-def list_runs(first: IntArray, size: IntArray) -> IntArray:
-    """Return the whole numbers of runs one after the other, each of `size` from `first` on."""
+def list_runs(first: IntArray, size: IntArray, step: int | np.integer = 1) -> IntArray:
+    """Return the whole numbers of runs one after the other, each of `size` from `first` on, `step` apart."""
     ends = np.cumsum(size, dtype=first.dtype)
-    return np.repeat(first - (ends - size), size) + np.arange(int(size.sum()), dtype=first.dtype)
+    numbers = np.arange(int(size.sum()), dtype=first.dtype)
+    numbers *= first.dtype.type(step)
+    numbers += np.repeat(first - step * (ends - size), size)
+    return numbers
 
 
 def number_used(triangles: NDArray[np.uint32], vertex_count: int) -> tuple[IntArray, NDArray[np.uint32]]:

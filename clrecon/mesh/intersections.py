@@ -133,7 +133,7 @@ def find_boxes(
     vertices: NDArray[np.floating], triangles: NDArray[np.uint32]
 ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
     """Return the lowest and the highest coordinates of each triangle, shape (m, 3)."""
-    low, high = (np.empty((len(triangles), 3), vertices.dtype) for _ in range(2))
+    low, high = (np.empty((3, len(triangles)), vertices.dtype).T for _ in range(2))  # columns are looked at
 
     def bound_triangles(span: slice) -> None:
         first, two, three = (vertices.take(corners, axis=0) for corners in triangles[span].T)

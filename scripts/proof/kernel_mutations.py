@@ -206,7 +206,7 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
         "faces_at": (("faces_at[one] = (int)face;", "faces_at[one] = (int)(faces - 1u - face);"),),
         "below": (("below[face] = one;", "below[face] = NO_FACE;"),),
     },
-    "sample_profiles": {"profiles": (("? value : NAN", "? -value : NAN"),)},
+    "sample_profiles": {"profiles": (("is_within, value", "is_within, -value"),)},
     "fit_profiles": {"fits": (("store_lanes(now.x0, fit);", "store_lanes(-now.x0, fit);"),)},
     "place_vertices": {"placed": (("placed[3 * vertex + axis] = (", "placed[3 * vertex + axis] = -("),)},
     "count_pieces": {"pieces": (("? 0 : count_across(b.left", "? 0 : ~count_across(b.left"),)},

@@ -127,14 +127,13 @@ class StackFrame:
         self.slices[:-1, 3] = 1.0 / self.gaps
 
     def places(self, points: NDArray[np.floating]) -> Float32Array:
-        """Return the kernel's places (n, 4) of points (n, 3) in LPS mm; the last column is the slice at or below."""
+        """Return the kernel's places (4, n) of points (n, 3) in LPS mm; the last row is the slice at or below."""
         in_stack = self._turn(points, self._origin)
-        layers = np.searchsorted(self._heights, in_stack[:, 2], side="right") - 1
-        in_stack[:, 3] = np.clip(layers, 0, max(len(self._heights) - 2, 0))
-        return in_stack
+        layers = np.searchsorted(self._heights, in_stack[2], side="right") - 1
+        return np.concatenate([in_stack, layers.clip(0, max(len(self._heights) - 2, 0))[None]], dtype=np.float32)
 
     def directions(self, normals: NDArray[np.floating]) -> Float32Array:
-        """Return the kernel's directions (n, 4) of unit vectors (n, 3) in LPS."""
+        """Return the kernel's directions (3, n) of unit vectors (n, 3) in LPS."""
         return self._turn(normals, np.zeros(3))
 
     def steps_along(self, normals: NDArray[np.floating], gap: Float32Array) -> Float32Array:
@@ -150,10 +149,10 @@ class StackFrame:
         return np.asarray(np.sqrt(np.sqrt(np.einsum("na,na->n", along, along))), np.float32)
 
     def _turn(self, vectors: NDArray[np.floating], origin: Float64Array) -> Float32Array:
-        turned = np.zeros((len(vectors), 4), np.float32)
+        turned = np.empty((3, len(vectors)), np.float32)
         x, y, z = np.ascontiguousarray(vectors.T) - origin[:, None]
-        for n, (a, b, c) in enumerate(self._matrix):  # a product of matrices takes eight times as long
-            turned[:, n] = a * x + b * y + c * z
+        for row, (a, b, c) in zip(turned, self._matrix, strict=True):  # a product of matrices takes eight times as long
+            row[:] = a * x + b * y + c * z
         return turned
 
 
@@ -343,30 +342,33 @@ class ProfileSampler:
             voxels_d = resident.whole(self._stopwatch)
             for begin in range(0, len(points), piece):
                 rows = np.arange(begin, min(begin + piece, len(points)))
-                yield rows, self._sample(voxels_d, 0, places[rows], directions[rows])
+                yield rows, self._sample(voxels_d, 0, places, directions, rows)
             return
         for first in range(0, nk, planned):
             low, high = max(first - reach, 0), min(first + planned + reach + 1, nk)
-            rows_of_slab = np.flatnonzero((places[:, 3] >= first) & (places[:, 3] < first + planned))
+            rows_of_slab = np.flatnonzero((places[3] >= first) & (places[3] < first + planned))
             if not len(rows_of_slab):
                 continue
             voxels_d = resident.part(low, high, self._stopwatch)
             for begin in range(0, len(rows_of_slab), piece):
                 rows = rows_of_slab[begin : begin + piece]
-                yield rows, self._sample(voxels_d, low, places[rows], directions[rows])
+                yield rows, self._sample(voxels_d, low, places, directions, rows)
             resident.volume.release_slices(low, high)
 
-    def _sample(self, voxels_d: Any, first_k: int, places: Float32Array, directions: Float32Array) -> Any:
+    def _sample(
+        self, voxels_d: Any, first_k: int, places: Float32Array, directions: Float32Array, rows: NDArray[np.intp]
+    ) -> Any:
         device, (ni, nj, nk) = self.device, self._resident.volume.shape_ijk
-        stride = stride_of(len(places))
-        values_d = allocate(device, 4 * ROWS * stride)
+        stride, lanes = stride_of(len(rows)), int(device.kernel_variants["LANES"])
+        values_d, columns = allocate(device, 4 * ROWS * stride), np.pad(rows, (0, stride - len(rows)), mode="edge")
         launch(
-            device, self.program["sample_profiles"], len(places), voxels=voxels_d,
-            slices=upload(device, self.frame.slices), places=upload(device, places),
-            directions=upload(device, directions), profiles=values_d, ni=ni, nj=nj, nk=nk, first_k=first_k,
-            first_mm=self.scale.first_mm, step_mm=self.scale.step_mm, usual_gap=self.frame.usual_gap,
-            i_square=self.frame.squares[0], j_square=self.frame.squares[1], known_k=self._known_k,
-            stride=stride, count=len(places),
+            device, self.program["sample_profiles"], -(-len(rows) // lanes), voxels=voxels_d,
+            slices=upload(device, self.frame.slices), places=upload(device, places.take(columns, axis=1)),
+            directions=upload(device, directions.take(columns, axis=1)), profiles=values_d,
+            ni=ni, nj=nj, nk=nk, first_k=first_k, first_mm=self.scale.first_mm, step_mm=self.scale.step_mm,
+            usual_gap=self.frame.usual_gap, i_square=self.frame.squares[0], j_square=self.frame.squares[1],
+            known_k=self._known_k,
+            stride=stride, count=len(rows),
         )  # fmt: skip
         return values_d
 

@@ -119,11 +119,11 @@ def _enter_into_rows(
     scaled: Float32Array, exponent: int, triangles: NDArray[np.uint32], grid: RowGrid, *boxes: Float32Array
 ) -> CrossingPlan:
     by_x = np.argsort(grid.steps(boxes[0][:, 0], 0).astype(np.uint16), kind="stable")
-    corners = [corner.take(by_x, axis=0) for corner in boxes]
-    (first_y, first_z), (last_y, last_z) = ([grid.steps(corner[:, n], n) for n in (1, 2)] for corner in corners)
-    wide, deep = last_y - first_y + 1, last_z - first_z + 1
-    z, wide_of_z = list_runs(first_z, deep), wide.repeat(deep)
-    rows = list_runs(first_y.repeat(deep), wide_of_z) + (int(grid.last[1]) + 1) * z.repeat(wide_of_z)
+    (first_y, first_z), (last_y, last_z) = ([grid.steps(corner[:, n], n) for n in (1, 2)] for corner in boxes)
+    along_y = np.int32(grid.last[1] + 1.0)
+    of_triangles = (first_y + along_y * first_z, last_y - first_y + 1, last_z - first_z + 1)
+    first, wide, deep = (numbers.take(by_x) for numbers in of_triangles)
+    rows = list_runs(list_runs(first, deep, along_y), wide.repeat(deep))
     order = order_by_number(rows, grid.rows)
     entries = by_x.astype(np.uint32).repeat(wide * deep).take(order)
     return CrossingPlan(scaled, exponent, triangles, grid, entries, rows.take(order).astype(np.uint32))

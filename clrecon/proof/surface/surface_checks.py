@@ -329,7 +329,7 @@ LABEL_CHECKS = (
 )
 
 
-PLACES = 700
+PLACES = 8_200
 """Profiles that are sampled."""
 
 _WALLS = 8200
