@@ -71,6 +71,22 @@ def test_the_nearest_distance_of_points_around_a_sphere_is_the_least_to_all_tria
     np.testing.assert_allclose(distances, expected, rtol=tolerances.FLOAT64_SHARE)
 
 
+def test_points_near_a_surface_are_measured_against_few_triangles(monkeypatch: pytest.MonkeyPatch) -> None:
+    vertices, triangles = sphere(rounds=4)
+    sizes: list[int] = []
+    shares = triangle_tree.nearest_shares
+
+    def count_shares(away: np.ndarray, b: np.ndarray, c: np.ndarray) -> tuple[np.ndarray, ...]:
+        sizes.append(away.shape[1])
+        return shares(away, b, c)
+
+    monkeypatch.setattr(triangle_tree, "nearest_shares", count_shares)
+
+    TriangleTree(vertices, triangles).nearest(1.001 * vertices[triangles].mean(axis=1))
+
+    assert sum(sizes) <= 16 * len(triangles)  # 10.9 each; 26 where one leaf beside the curve is looked at first
+
+
 def test_results_do_not_depend_on_the_pairs_that_are_looked_at_together(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
