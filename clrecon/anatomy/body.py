@@ -102,7 +102,7 @@ def remove_table(volume: Volume, *, allow_bone_loss: bool = False, progress: Pro
     step = cells.step
 
     def outside(k: int) -> Mask:
-        nk, nj, ni = volume.voxels.shape
+        _, nj, ni = volume.voxels.shape
         return np.asarray(~np.repeat(np.repeat(body[k // step[2]], step[0], 1), step[1], 0)[:nj, :ni])
 
     figures = {"body_share": round(float(body.mean()), 4), **bone, "bone_removed": removed}

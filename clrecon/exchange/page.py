@@ -286,10 +286,10 @@ def _join_parts(meshes: Sequence[Content], numbers: NDArray[np.uint16]) -> tuple
             corners = corners[np.argsort(mesh.pieces.of_triangle.astype(few_bits), kind="stable")]
         triangles.append(corners)
         before += len(mesh.vertices)
+        called = mesh.title or mesh.name or (f"surface {number}" if len(meshes) > 1 else "")
+        color = to_hexadecimal(BONE_COLOR if mesh.color is None else mesh.color)
         for name, count, ml in _pieces(mesh):
-            called = mesh.title or mesh.name or (f"surface {number}" if len(meshes) > 1 else "")
             named = " ".join(filter(None, (called, name)))
-            color = to_hexadecimal(BONE_COLOR if mesh.color is None else mesh.color)
             parts.append({"name": named or "surface", "color": color, "ml": ml, "first": first, "count": count})
             first += count
     coded = encode_surface(np.concatenate(vertices), np.concatenate(normals), np.concatenate(triangles), numbers)

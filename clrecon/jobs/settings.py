@@ -145,7 +145,7 @@ _INSIDE_VIEW = "130,20"
 
 def _parse_band(text: str) -> tuple[float | None, float | None]:
     """Read ``A``, ``A:`` or ``A:B``, numbers of HU; ``:B`` leaves the lower end open."""
-    low, colon, high = text.partition(":")
+    low, _, high = text.partition(":")
     try:
         ends = [float(end) if end else None for end in (low, high)]
     except ValueError:

@@ -458,7 +458,7 @@ def _measure_corridor(
     ends = line_points(np.array([[line.x, line.z, line.medial_deg, line.sagittal_deg]]), span)[0]
     first, last = ends[0], ends[-1]
     axis = last - first
-    distance, voxels, by_hu = _walls(bone, frame, surface, first, last, line.radius)
+    voxels, by_hu = _walls(bone, frame, surface, first, last, line.radius)
     refused = None
     if line.radius > _LARGEST_RADIUS_MM:
         refused = f"the widest line has a radius of {line.radius:.1f} mm: that is no pedicle of one vertebra"
@@ -489,11 +489,11 @@ def _measure_corridor(
 
 def _walls(
     bone: SolidBone, frame: VertebraFrame, surface: Float64Array, first: Float64Array, last: Float64Array, radius: float
-) -> tuple[float, float, float]:
-    """Return the distance of the nearest wall, its width in voxels, and the share of the walls that HU place."""
+) -> tuple[float, float]:
+    """Return the width of a line in voxels along the way to the nearest wall, and the share of walls that HU place."""
     offsets, _ = segment_offsets(surface, first, last)
     distance = np.linalg.norm(offsets, axis=1)
     nearest = int(distance.argmin())
     voxel = float(np.abs(bone.steps.T @ ((offsets[nearest] / distance[nearest]) @ frame.axes)).max())
     beside = distance <= radius + BESIDE_MM
-    return float(distance[nearest]), 2.0 * radius / voxel, float(bone.by_hu[beside].mean())
+    return 2.0 * radius / voxel, float(bone.by_hu[beside].mean())

@@ -478,13 +478,9 @@ def _marrow(scan: Field, looks: Looks, piece: Piece) -> tuple[float, float]:
 
 def beside_share(scan: Field, looks: Looks, piece: Piece, level: float) -> float:
     """Return the share of bone right beside a body: muscle stands there, but at the sacrum its wings."""
-    rows = range(*_middle_rows(piece).indices(len(scan)))
     side = looks.side_mm[max(piece.begin - 20, 0)]  # of the body above: the wings have no side wall
-    beside = []
-    for n in rows:
-        ahead = (AHEAD_MM >= BODY_BACK_MM - 4.0) & (AHEAD_MM <= BODY_BACK_MM + 10.0)
-        aside = np.abs(np.abs(ASIDE_MM) - side - 7.0) <= 4.0
-        beside.append(scan[n][ahead][:, aside])
-    known = np.concatenate([part.ravel() for part in beside])
-    known = known[np.isfinite(known)]
+    ahead = (AHEAD_MM >= BODY_BACK_MM - 4.0) & (AHEAD_MM <= BODY_BACK_MM + 10.0)
+    aside = np.abs(np.abs(ASIDE_MM) - side - 7.0) <= 4.0
+    beside = scan[_middle_rows(piece)][:, ahead][:, :, aside]
+    known = beside[np.isfinite(beside)]
     return float((known >= level).mean()) if known.size else 0.0

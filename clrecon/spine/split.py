@@ -7,7 +7,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -266,8 +266,11 @@ def split_vertebrae(
     progress("vertebrae", 3, 4)
     voxel_ml = float(abs(np.linalg.det(volume.affine[:3, :3])) / 1000.0)
     behind = pieces[(part.ahead < -_ARCH_BEHIND_MM) & (np.abs(part.aside) < ARCH_ASIDE_MM)]
-    arches = np.asarray(voxel_ml * np.bincount(behind, minlength=len(discs.bounds) + 2), dtype=np.float64)
-    spans, left_out = _spans(discs, pieces, doubtful, rim, arches, voxel_ml, hu)
+    volumes, arches = (
+        voxel_ml * np.bincount(voxels, minlength=len(discs.bounds) + 2) for voxels in (pieces.ravel(), behind)
+    )
+    measures = {"volume_ml": volumes, "doubtful_share": doubtful, "rim_share": rim, "arch_ml": arches}
+    spans, left_out = _spans(discs, pieces, measures, hu)
     position = 0 if landmark is None else _place_of(landmark, spans, discs, volume, part.first, pieces)
     names = name_levels(len(spans), None if level_name is None else (position, level_name))
     vertebrae = _judge_all(spans, names, discs)
@@ -364,43 +367,33 @@ def _choose_level(discs: _Found) -> float:
 
 
 def _spans(
-    discs: _Found, pieces: NDArray[np.uint8], doubtful: Float64Array, rim: Float64Array, arches: Float64Array,
-    voxel_ml: float, level: float,
-) -> tuple[list[tuple[int, Piece]], list[str]]:  # fmt: skip
-    """Return the number and span of each piece that is a vertebra, and what else was seen."""
+    discs: _Found, pieces: NDArray[np.uint8], measures: Mapping[str, NDArray[Any]], level: float
+) -> tuple[list[tuple[int, Piece]], list[str]]:
+    """Return the number and span of each piece that is a vertebra, and what else was seen.
+
+    `measures` are fields of a `Piece`, each by the number of the piece.
+    """
     from scipy.ndimage import find_objects
 
-    bounds, course = discs.bounds, discs.course
-    volumes = np.bincount(pieces.ravel(), minlength=len(bounds) + 2) * voxel_ml
+    bounds = discs.bounds
     boxes = find_objects(pieces, max_label=len(bounds) + 1)
     spans, left_out = [], []
     gaps = [float(b.at - a.at) for a, b in itertools.pairwise(bounds)] or [30.0]
-    for n in range(len(bounds) + 1):
-        upper = bounds[n - 1] if n else None
-        lower = bounds[n] if n < len(bounds) else None
-        begin, end = (upper.at if upper else 0), (lower.at if lower else len(course))
-        share = 0.0
-        if boxes[n] is not None:
-            sizes = Regions(pieces[boxes[n]] == n + 1, FACES).sizes
-            share = float(sizes.max() / sizes.sum())
+    for number, (upper, lower) in enumerate(itertools.pairwise([None, *bounds, None]), 1):
+        begin, end = (upper.at if upper else 0), (lower.at if lower else len(discs.course))
         if end <= begin:
             continue
-        piece = Piece(
-            upper,
-            lower,
-            begin,
-            end,
-            volume_ml=float(volumes[n + 1]),
-            largest_share=share,
-            doubtful_share=float(doubtful[n + 1]),
-            rim_share=float(rim[n + 1]),
-            arch_ml=float(arches[n + 1]),
-        )
+        share = 0.0
+        if (box := boxes[number - 1]) is not None:
+            sizes = Regions(pieces[box] == number, FACES).sizes
+            share = float(sizes.max() / sizes.sum())
+        measured = {name: float(by_piece[number]) for name, by_piece in measures.items()}
+        piece = Piece(upper, lower, begin, end, largest_share=share, **measured)
         reason = _no_vertebra(piece, discs, gaps, level)
         if reason is None:
-            spans.append((n + 1, piece))
+            spans.append((number, piece))
         elif reason:
-            side_text = "above the first vertebra" if n == 0 else "below the last vertebra"
+            side_text = "above the first vertebra" if number == 1 else "below the last vertebra"
             left_out.append(f"{side_text} {reason}")
     return spans, left_out
 
@@ -409,7 +402,7 @@ def _no_vertebra(piece: Piece, discs: _Found, gaps: list[float], level: float) -
     """Return why a piece is no vertebra, None where it may be one, "" where there is nothing to tell."""
     height = piece.end - piece.begin
     known = piece.upper or piece.lower
-    if known is None or (known is not None and not known.is_disc and not piece.whole):
+    if known is None or not (known.is_disc or piece.whole):
         return ""  # beyond the end of the bone
     if piece.lower is None or not piece.lower.is_disc:
         share = beside_share(discs.scan, discs.looks, piece, level)

@@ -53,9 +53,8 @@ def spans_and_left_out(monkeypatch: pytest.MonkeyPatch) -> tuple[list[Any], list
     monkeypatch.setattr(split, "beside_share", lambda *given: 0.0)
     depth, bounds = np.zeros((90, 1)), [Bound(at=place, tilt=8, depth_hu=90.0) for place in (10, 40)]
     looked = split._Found(straight_course(90), depth, looks_of_depth(depth), bounds, np.zeros(90))
-    nothing = np.zeros(4)
-    pieces = np.zeros((2, 2, 2), np.uint8)
-    return split._spans(looked, pieces, doubtful=nothing, rim=nothing, arches=nothing, voxel_ml=1.0, level=200.0)
+    measures = dict.fromkeys(("volume_ml", "doubtful_share", "rim_share", "arch_ml"), np.zeros(4))
+    return split._spans(looked, np.zeros((2, 2, 2), np.uint8), measures, level=200.0)
 
 
 def test_a_vertebra_reaches_from_one_disc_to_the_next(spans_and_left_out: tuple[list[Any], list[str]]) -> None:
