@@ -19,6 +19,7 @@ import level_phantoms  # isort: skip
 import marked_tables  # isort: skip
 import measure_corridors  # isort: skip
 import measure_levels  # isort: skip
+import measure_prints  # isort: skip
 import measure_reconstructions  # isort: skip
 
 PAGE = measure_levels.PAGE.read_text(encoding="utf-8")
@@ -30,7 +31,10 @@ def test_page_of_iso_values_has_the_table_of_the_recorded_figures(name: str) -> 
     assert marked_tables.find_table(PAGE, name) == measure_levels.tables()[name]
 
 
-@pytest.mark.parametrize("measure", [measure_reconstructions, measure_corridors], ids=lambda module: module.TABLE)
+MEASURED = (measure_reconstructions, measure_corridors, measure_prints)
+
+
+@pytest.mark.parametrize("measure", MEASURED, ids=lambda module: module.TABLE)
 def test_page_has_the_table_that_was_measured(measure: Any) -> None:
     figures = json.loads(measure.FIGURES.read_text(encoding="utf-8"))
     assert marked_tables.find_table(measure.PAGE.read_text(encoding="utf-8"), measure.TABLE) == measure.make_table(
