@@ -69,7 +69,10 @@ class Walls:
 
 
 def find_walls(near: Words, negative: Words, inside: Words, nx: int) -> Walls:
-    """Count the faces of a surface and those without support; see its twin in `clrecon.proof.points.field`.
+    """Count the faces between inner and outer nodes, and those without support.
+
+    A face is supported where both nodes are near and the field has two signs there.  Where it has one, the signs of far
+    nodes have come through a hole in the cloud and stopped at the points of the other side: a wall.
 
     The masks, (nz, ny, words) uint32, bit b of word w being node 32 w + b of `nx` in a row, are of nodes within the
     bridge of a point, of the sign of the field there, and of the decided sign.

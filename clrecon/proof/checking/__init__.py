@@ -35,11 +35,11 @@ class Check:
 def require_equal(found: ArrayLike, expected: ArrayLike, subject: str) -> None:
     """Refuse arrays that are not equal element by element."""
     actual, wanted = np.asarray(found), np.asarray(expected)
-    if actual.shape != wanted.shape:
-        raise DeviceError(f"{subject}: {_describe_shape(actual)} in place of {_describe_shape(wanted)}")
+    _require_shape(actual, wanted, subject)
     wrong = int(np.count_nonzero(actual != wanted))
     if wrong:
-        raise DeviceError(f"{subject}: {wrong:,} of {actual.size:,} differ")
+        numbers = f", {actual} in place of {wanted}" if actual.ndim == 0 else ""
+        raise DeviceError(f"{subject}: {wrong:,} of {actual.size:,} differ{numbers}")
 
 
 def require_close(found: ArrayLike, expected: ArrayLike, allowed: float, subject: str) -> float:
@@ -50,8 +50,7 @@ def require_close(found: ArrayLike, expected: ArrayLike, allowed: float, subject
 def require_share(found: ArrayLike, expected: ArrayLike, allowed: float, share: float, subject: str) -> float:
     """Refuse where more than a share is more than `allowed` apart; return the largest distance of the others."""
     actual, wanted = np.asarray(found, dtype=np.float64), np.asarray(expected, dtype=np.float64)
-    if actual.shape != wanted.shape:
-        raise DeviceError(f"{subject}: {_describe_shape(actual)} in place of {_describe_shape(wanted)}")
+    _require_shape(actual, wanted, subject)
     with np.errstate(invalid="ignore"):
         away = np.abs(actual - wanted)
     away = np.where(np.isnan(actual) & np.isnan(wanted), 0.0, away)
@@ -64,15 +63,27 @@ def require_share(found: ArrayLike, expected: ArrayLike, allowed: float, share: 
     return float(away[~wrong].max(initial=0.0))
 
 
+def _require_shape(actual: NDArray[Any], wanted: NDArray[Any], subject: str) -> None:
+    if actual.shape != wanted.shape:
+        counts = (" x ".join(f"{n:,}" for n in array.shape) for array in (actual, wanted))
+        raise DeviceError(f"{subject}: {' elements in place of '.join(counts)} elements")
+
+
+def require_colors(
+    image: NDArray[np.uint8], expected: NDArray[Any], allowed: float, subject: str, share: float = 0.0
+) -> float:
+    """Refuse a picture (..., 4) that is not as expected over black, premultiplied, of 255; see `require_share`."""
+    opacity = image[..., 3:].astype(np.float64)
+    shown = np.concatenate([image[..., :3] * (opacity / 255.0), opacity], axis=-1)
+    away = np.abs(shown - expected).max(axis=-1)
+    return require_share(away, np.zeros_like(away), allowed, share, f"{subject}, of 255")
+
+
 def require_whole(report: Mapping[str, Any]) -> None:
     """Refuse a result made in parts: wrong sums look like a lack of memory, and thin slabs may hide a fault."""
     words = [text for text in report["warnings"] if "continued with" in text]
     if words or report.get("slabs", 1) != 1:
         raise DeviceError(f"made in parts: {'; '.join(words) or 'the device has too little memory'}")
-
-
-def _describe_shape(array: np.ndarray[Any, Any]) -> str:
-    return f"{' x '.join(f'{n:,}' for n in array.shape)} elements"
 
 
 OBLIQUE = np.array([[0.7, 0.1, 0.05, -50.0], [-0.1, 0.5, 0.02, -30.0], [0.0, 0.05, 0.9, -146.0], [0.0, 0.0, 0.0, 1.0]])

@@ -128,35 +128,3 @@ def fill_nodes(
     """Return the volume, positive inside: near nodes have |f|, `least` to `far_value`, all others `far_value`."""
     size = np.where(near, np.clip(np.abs(field.value), least, far_value), far_value)
     return np.where(signs.inside, size, -size)
-
-
-def find_walls(
-    near: NDArray[np.bool_], negative: NDArray[np.bool_], inside: NDArray[np.bool_], cube: int
-) -> dict[tuple[int, int, int], tuple[int, int, float]]:
-    """Count the faces between inner and outer nodes, and those that no points support.
-
-    A face is supported where both nodes are near and the field has two signs there.  Where it has one, the signs of far
-    nodes have come through a hole in the cloud and stopped at the points of the other side: a wall.
-
-    Return by cube (z, y, x) of `cube` nodes, that of their lower node: faces, walls, and the volume that these walls
-    enclose in cubes of the spacing, by the divergence of x - c, their mean place c.
-    """
-    faces: dict[tuple[int, int, int], int] = {}
-    walls: dict[tuple[int, int, int], list[tuple[NDArray[np.float64], NDArray[np.float64]]]] = {}
-    for axis in range(3):
-        step = np.eye(3, dtype=int)[axis]
-        for lower in np.argwhere(np.ones(near.shape, bool)):
-            upper = lower + step
-            if upper[axis] == near.shape[axis] or inside[tuple(lower)] == inside[tuple(upper)]:
-                continue
-            z, y, x = (int(place) // cube for place in lower)
-            faces[z, y, x] = faces.get((z, y, x), 0) + 1
-            if not (near[tuple(lower)] and near[tuple(upper)] and negative[tuple(lower)] != negative[tuple(upper)]):
-                towards = -step if inside[tuple(lower)] else step
-                walls.setdefault((z, y, x), []).append((lower + 0.5 * step, towards.astype(float)))
-    result = {}
-    for key, count in faces.items():
-        seen = walls.get(key, [])
-        middle = np.mean([at for at, _ in seen], axis=0) if seen else np.zeros(3)
-        result[key] = (count, len(seen), sum(float((at - middle) @ normal) for at, normal in seen) / 3.0)
-    return result

@@ -23,14 +23,15 @@ from clrecon.proof.checking import (
     centre_of,
     look_at,
     require_close,
+    require_colors,
     require_equal,
-    require_share,
     require_whole,
 )
 from clrecon.proof.rays.objects import ColoredMesh, Meetings, find_meetings, nth_layer, shade_layer
+from clrecon.proof.rays.ray_checks import COLOR_255, EDGE_SHARE, FIXED, RENDERED, SOFT
 from clrecon.proof.rays.render import cast_rays
 from clrecon.proof.rays.surface import overlay_slices as overlay_twin
-from clrecon.rendering import UNSHADED, Lighting, TransferFunction
+from clrecon.rendering import UNSHADED
 from clrecon.rendering.pictures.object_looks import MeshLook
 from clrecon.rendering.pictures.styles import SlicesInSpace, VolumeLook
 from clrecon.rendering.views.camera import Camera
@@ -46,13 +47,9 @@ TRIANGLES, SPLIT = 660, 90
 """All triangles, every seventh of which fills a quarter of the picture; from `SPLIT` on they are opaque."""
 
 OPACITY = 0.35
-COLOR_255 = 2.0
 DEPTH_MM = 1e-3
-EDGE_SHARE = 0.01
 _BETWEEN_255 = 3.5
 """As COLOR_255, and the hundredth behind what is nearly opaque, which rays leave out."""
-
-FIXED = Lighting(0.15, 0.7, 0.4, 20.0, direction=(0.4, -1.0, 0.8))
 
 
 def _soup() -> tuple[Mesh, NDArray[np.uint8]]:
@@ -142,10 +139,7 @@ def _check_layers(device: Device) -> str:
         require_equal(first.open_pixels, np.count_nonzero(more), "pixels that may have a second layer")
         require_close(layered.depth, depth, DEPTH_MM, "depths of triangles, in mm")
         require_close(layered.expected_depth, mean, DEPTH_MM, "expected depths of triangles, in mm")
-        opacity = layered.image[..., 3:].astype(np.float64)
-        shown = np.concatenate([layered.image[..., :3] * (opacity / 255.0), opacity], axis=-1)
-        away = np.abs(shown - 255.0 * rgba).max(axis=-1)
-        worst = max(worst, require_close(away, np.zeros_like(away), COLOR_255, "colours of triangles, of 255"))
+        worst = max(worst, require_colors(layered.image, 255.0 * rgba, COLOR_255, "colours of triangles"))
     return f"2 pictures of {SIZE[0]} x {SIZE[1]} pixels within {worst:.1f} of 255"
 
 
@@ -178,13 +172,12 @@ def _check_between(device: Device, slices: bool) -> str:
     """Show a volume with a translucent screen across it: the twin's part before it, the screen, and the part behind."""
     worst, opacity = 0.0, 0.4
     color = np.array([0.2, 0.9, 0.4])
-    function = TransferFunction([(-300, 0.9, 0.2, 0.1, 0.0), (200, 1, 0.7, 0.4, 0.15), (900, 1, 1, 0.9, 0.6)])
     screen = MeshLook(tuple(color.tolist()), opacity=opacity, lighting=UNSHADED)
     for perspective in (False, True):
         volume = blobs((16, 26, 22), OBLIQUE, "int16")
         camera = look_at(volume, (0.4, 0.9, -0.5), 7.0, perspective=perspective)
         mesh, before, behind = _screen(volume, camera)
-        look: VolumeLook | SlicesInSpace = VolumeLook(function, lighting=FIXED)
+        look: VolumeLook | SlicesInSpace = VolumeLook(SOFT, lighting=FIXED)
         if slices:
             look = SlicesInSpace([1, 4, 7, 9, 12], opacity=0.4, lowest_hu=-300.0, window=(-500.0, 700.0))
         with ScenePictures([(volume, look), (mesh, screen)], device=device) as pictures:
@@ -199,21 +192,15 @@ def _check_between(device: Device, slices: bool) -> str:
             sides.append(np.clip(rgba, 0.0, 1.0))
         rest = opacity * np.append(color, 1.0) + (1.0 - opacity) * sides[1]
         expected = sides[0] + (1.0 - sides[0][..., 3:]) * rest
-        alpha = picture.image[..., 3:].astype(np.float64)
-        shown = np.concatenate([picture.image[..., :3] * (alpha / 255.0), alpha], axis=-1)
-        away = np.abs(shown - 255.0 * expected).max(axis=-1)
-        worst = max(
-            worst, require_share(away, np.zeros_like(away), _BETWEEN_255, EDGE_SHARE, "colours about a screen, of 255")
-        )
+        subject = "colours about a screen"
+        worst = max(worst, require_colors(picture.image, 255.0 * expected, _BETWEEN_255, subject, EDGE_SHARE))
     return f"2 pictures of {_WITH_VOLUME[0]} x {_WITH_VOLUME[1]} pixels within {worst:.1f} of 255"
 
-
-RENDERED = ("measure_cells", "mark_bricks", "spread_in_rows", "spread_along", "enter_tiles", "look_ahead")
 
 CHECKS = (
     Check(
         "a volume before and behind triangles",
-        (*RENDERED, "composite_rays"),
+        RENDERED,
         partial(_check_between, slices=False),
         {"rays/composite.cl": ("BETWEEN",)},
     ),

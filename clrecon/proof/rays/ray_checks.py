@@ -40,6 +40,7 @@ from clrecon.proof.checking import (
     centre_of,
     look_at,
     require_close,
+    require_colors,
     require_equal,
     require_share,
     require_whole,
@@ -259,19 +260,13 @@ _DIM = TransferFunction([(20, 0.9, 0.2, 0.1, 0.0), (90, 1, 0.7, 0.4, 0.2), (130,
 """A transfer function for voxels of 8 bits."""
 
 
-def _premultiplied(image: NDArray[np.uint8]) -> NDArray[np.float64]:
-    opacity = image[..., 3:].astype(np.float64)
-    return np.concatenate([image[..., :3] * (opacity / 255.0), opacity], axis=-1)
-
-
 def _compare_picture(picture: Rendering, image: NDArray[Any], depth: NDArray[Any], subject: str) -> float:
     """Compare colours over black and depths, pixel by pixel."""
     require_whole(picture.report)
     both = np.isfinite(picture.depth) & np.isfinite(depth)
     require_share(np.isfinite(picture.depth), np.isfinite(depth), 0.0, EDGE_SHARE, f"hits of {subject}")
     require_share(picture.depth[both], depth[both], DEPTH_MM, 2.0 * EDGE_SHARE, f"depths of {subject}, in mm")
-    away = np.abs(_premultiplied(picture.image) - image).max(axis=-1)
-    return require_share(away, np.zeros_like(away), COLOR_255, EDGE_SHARE, f"colours of {subject}, of 255")
+    return require_colors(picture.image, image, COLOR_255, f"colours of {subject}", EDGE_SHARE)
 
 
 def _cut_middle(volume: Volume) -> Clip:
@@ -333,8 +328,7 @@ def _check_composite_labels(device: Device) -> str:
         tint = np.where((column == 3)[:, None], (0.9, 0.1, 0.1), (0.5, 0.5, 0.5))
         row = 255.0 * np.concatenate([tint * opacity[:, None], opacity[:, None]], axis=1)
         inner = (column == np.roll(column, 1)) & (column == np.roll(column, -1))
-        away = np.abs(_premultiplied(picture.image) - row)[:, inner].max(axis=-1)
-        require_close(away, np.zeros_like(away), COLOR_255, f"colours of labels of type {dtype}, of 255")
+        require_colors(picture.image[:, inner], row[inner], COLOR_255, f"colours of labels of type {dtype}")
     return f"2 pictures with labels of {SIZE[0]} x {SIZE[1]} pixels as computed"
 
 
@@ -393,8 +387,8 @@ def _check_surface_labels(device: Device) -> str:
         colors = 255.0 * np.array([(1, 1, 1, 1), (1, 0, 0, 1), (0, 0, 1, 1), (0.4, 0.4, 0.4, 0.4)])
         inner = (np.arange(SIZE[0]) % 8 > 1) & (np.arange(SIZE[0]) % 8 < 6)
         rows = slice(3, SIZE[1] - 3)
-        away = np.abs(_premultiplied(picture.image) - colors[column])[rows, inner].max(axis=-1)
-        require_close(away, np.zeros_like(away), COLOR_255, f"colours of labels of type {dtype}, of 255")
+        shown, expected = picture.image[rows, inner], colors[column[inner]]
+        require_colors(shown, expected, COLOR_255, f"colours of labels of type {dtype}")
     return f"2 pictures with labels of {SIZE[0]} x {SIZE[1]} pixels as computed"
 
 
@@ -428,8 +422,7 @@ def _check_points(device: Device) -> str:
         rgba, far = shade_splats(depth, numbers, colors[:, :3] / 255.0, point_normals, camera, FIXED, apart)
         require_equal(splats.image[..., 3] > 0, numbers >= 0, "pixels with a point")
         require_close(splats.depth, far, DEPTH_MM, "depths of points, in mm")
-        away = np.abs(_premultiplied(splats.image) - 255.0 * rgba).max(axis=-1)
-        worst = max(worst, require_close(away, np.zeros_like(away), COLOR_255, "colours of points, of 255"))
+        worst = max(worst, require_colors(splats.image, 255.0 * rgba, COLOR_255, "colours of points"))
     return f"2 pictures of {SIZE[0]} x {SIZE[1]} pixels within {worst:.1f} of 255"
 
 

@@ -56,16 +56,10 @@ def _find_cases(inside: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 
 def _edge_vertices(numbers: NDArray[np.int64], cells: NDArray[np.int64], edge: int) -> NDArray[np.int64]:
+    """Return the vertices on an edge of cells; `numbers[k, j, i, axis]` is that on the edge that a sample owns."""
     axis, low, _ = EDGES[edge]
     k, j, i = (cells + CORNERS[low][::-1]).T
     return np.asarray(numbers[k, j, i, axis])
-
-
-def _edge_vertex(numbers: NDArray[np.int64], cell: NDArray[np.int64], edge: int) -> int:
-    """Return the vertex on an edge of a cell; `numbers[k, j, i, axis]` is the vertex on the edge that a sample owns."""
-    axis, low, _ = EDGES[edge]
-    k, j, i = cell + CORNERS[low][::-1]
-    return int(numbers[k, j, i, axis])
 
 
 def _find_triangles(
@@ -105,7 +99,7 @@ def _find_trilinear_triangles(
         for triangle in row.triangles:
             triangles.append(
                 [
-                    first + len(cells) + v - CELL_VERTEX if v >= CELL_VERTEX else _edge_vertex(numbers, cell, v)
+                    first + len(cells) + v - CELL_VERTEX if v >= CELL_VERTEX else int(_edge_vertices(numbers, cell, v))
                     for v in triangle
                 ]
             )

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule, choose_iso_rule
-from clrecon.labels.label_levels import FULL, KEEP, REACH, Growth, fill_solid, find_boxes, level_biases, next_level
+from clrecon.labels.label_levels import FULL, KEEP, REACH, Growth, fill_solid, find_boxes, level_biases
 from clrecon.proof.surface import extract
 
 
@@ -175,24 +175,3 @@ def _find_leads(
         for end_number, ends in enumerate((edges.near, edges.far)):
             leads[end_number][among] = (values - rival)[ends][among]
     return np.where(starts, leads[0], -leads[0]), np.where(starts, -leads[1], leads[1])
-
-
-def _volume_mm3(vertices: NDArray[np.float64], triangles: NDArray[np.uint32]) -> float:
-    corners = (vertices - vertices.mean(axis=0))[triangles]
-    return float(np.einsum("ni,ni->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))) / 6.0
-
-
-def choose_level(
-    labels: NDArray[Any], affine: NDArray[np.float64], number: int, enclosed: Mapping[int, int] | None = None
-) -> int:
-    """Choose the level at which the mesh of a label encloses the volume of its voxels, as `extract_label_mask`."""
-    if enclosed and number in enclosed:
-        return enclosed[number]
-    wanted = np.count_nonzero(labels == number) * abs(np.linalg.det(affine[:3, :3]))
-    tried: list[tuple[int, float]] = []
-    level = next_level(tried, wanted, -1.0)
-    while all(level != earlier for earlier, _ in tried):
-        vertices, _, triangles = extract_label_mask(labels, affine, number, level, enclosed=enclosed)
-        tried.append((level, _volume_mm3(vertices, triangles)))
-        level = next_level(tried, wanted, -wanted / FULL)
-    return level

@@ -98,23 +98,16 @@ def _check_first_and_second(device: Device) -> str:
     return f"4 surfaces: triangles equal, vertices within {worst:.1e} voxel"
 
 
-def _check_types(device: Device) -> str:
-    worst = 0.0
-    for dtype in ("int8", "uint8", "uint16", "int32"):
-        volume = stack(waves((130, 44, 7), dtype), OBLIQUE)
-        worst = max(worst, _compare_surfaces(device, volume, (40.5, 61.0), f"{dtype} voxels"))
-    return f"8 surfaces of 4 types: triangles equal, vertices within {worst:.1e} voxel"
-
-
 def _check_variant(
-    device: Device, make: Callable[[tuple[int, int, int], str], NDArray[Any]], shape: tuple[int, int, int],
-    level: Level, *, uneven: bool = False, types: tuple[str, ...] = ("int16", "float32"), **options: Any,
+    device: Device, levels: tuple[Level, ...], make: Callable[[tuple[int, int, int], str], NDArray[Any]] = waves,
+    shape: tuple[int, int, int] = WIDE, uneven: bool = False, types: tuple[str, ...] = ("int16", "float32"),
+    **options: Any,
 ) -> str:  # fmt: skip
     worst = 0.0
     for dtype in types:
         volume = stack(make(shape, dtype), OBLIQUE, uneven=uneven)
-        worst = max(worst, _compare_surfaces(device, volume, (level,), f"{dtype} voxels", **options))
-    return f"{len(types)} surfaces: triangles equal, vertices within {worst:.1e} voxel"
+        worst = max(worst, _compare_surfaces(device, volume, levels, f"{dtype} voxels", **options))
+    return f"{len(types) * len(levels)} surfaces: triangles equal, vertices within {worst:.1e} voxel"
 
 
 GROWING = (
@@ -191,23 +184,27 @@ TRILINEAR = ("count_cells", "make_room", "emit_cell_triangles", "emit_cell_verti
 
 SURFACE_CHECKS = (
     Check("extract_isosurface", ("classify_samples", "classify_bricks", *_MARCHING), _check_first_and_second),
-    Check("types of voxels", ("classify_samples", "classify_bricks", *_MARCHING), _check_types),
+    Check(
+        "types of voxels",
+        ("classify_samples", "classify_bricks", *_MARCHING),
+        partial(_check_variant, levels=(40.5, 61.0), shape=(130, 44, 7), types=("int8", "uint8", "uint16", "int32")),
+    ),
     Check(
         "uneven slices",
         ("classify_samples", *_MARCHING),
-        partial(_check_variant, make=waves, shape=WIDE, level=30.0, uneven=True),
+        partial(_check_variant, levels=(30.0,), uneven=True),
         {"surface/marching_cubes.cl": ("UNEVEN",)},
     ),
     Check(
         "ranges",
         ("classify_samples", *_MARCHING),
-        partial(_check_variant, make=waves, shape=WIDE, level=(30.0, 60.0)),
+        partial(_check_variant, levels=((30.0, 60.0),)),
         {"masks/classify.cl": ("RANGE",), "surface/marching_cubes.cl": ("RANGE",)},
     ),
     Check(
         "below a level",
         ("classify_samples", *_MARCHING),
-        partial(_check_variant, make=waves, shape=WIDE, level=30.0, below=True),
+        partial(_check_variant, levels=(30.0,), below=True),
         {"masks/classify.cl": ("BORDER_INSIDE",)},
     ),
     Check(
@@ -219,19 +216,19 @@ SURFACE_CHECKS = (
     Check(
         "golden sections",
         _MARCHING,
-        partial(_check_variant, make=waves, shape=WIDE, level=30.0, types=("int16",), vertex_rule="golden"),
+        partial(_check_variant, levels=(30.0,), types=("int16",), vertex_rule="golden"),
         {"surface/marching_cubes.cl": ("GOLDEN",)},
     ),
     Check(
         "search by golden sections",
         _MARCHING,
-        partial(_check_variant, make=waves, shape=WIDE, level=30.0, types=("int16",), vertex_rule="golden-search"),
+        partial(_check_variant, levels=(30.0,), types=("int16",), vertex_rule="golden-search"),
         {"surface/marching_cubes.cl": ("GOLDEN_SEARCH",)},
     ),
     Check(
         "trilinear topology",
         ("classify_samples", *(kernel for kernel in _MARCHING if kernel != "emit_triangles"), *TRILINEAR),
-        partial(_check_variant, make=noise, shape=LONG, level=2.5, topology="trilinear"),
+        partial(_check_variant, levels=(2.5,), make=noise, shape=LONG, topology="trilinear"),
     ),
 )
 
@@ -260,8 +257,7 @@ def _check_labels(device: Device) -> str:
         placed = resample_labels(label_map, volume).voxels
         inside = twin.find_solid(volume, placed, 30.0, closed=closed, solid=(big,) if solid else ())
         meshes = extract_labels(volume, label_map, 30.0, device=device, closed=closed, solid=solid)
-        if list(meshes) != [big]:
-            raise DeviceError(f"labels {list(meshes)} have a surface in place of [{big}]")
+        require_equal(list(meshes), [big], "labels that have a surface")
         expected = twin.extract_label(volume, inside, big, 30.0, closed=closed)
         worst = max(worst, compare_mesh(volume, meshes[big], expected, f"label {big} in {dtype} voxels"))
     return f"2 labels: triangles equal, vertices within {worst:.1e} voxel"

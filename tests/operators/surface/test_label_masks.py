@@ -14,7 +14,16 @@ from variants import daily, daily_rows
 from clrecon.errors import DeviceError, RefusedInputError, UsageError
 from clrecon.geometry import apply_affine
 from clrecon.labels import LabelMap
-from clrecon.labels.label_levels import FULL, KEEP, Borders, choose_levels, count_faces, find_boxes, find_enclosed
+from clrecon.labels.label_levels import (
+    FULL,
+    KEEP,
+    Borders,
+    choose_levels,
+    count_faces,
+    find_boxes,
+    find_enclosed,
+    next_level,
+)
 from clrecon.mesh.triangles import enclosed_ml
 from clrecon.opencl import Stopwatch
 from clrecon.operators.surface.label_masks import extract_label_masks, survey_labels
@@ -74,13 +83,25 @@ def test_surfaces_of_label_masks_equal_their_twin(device, shape, closed):
 LEVELS_OFF = 2  # of FULL: sums of float32 may end on the other side of a whole number
 
 
+def choose_level(labels, number):
+    """The level at which the twin's mesh of a label encloses the volume of its voxels."""
+    wanted = np.count_nonzero(labels == number) * abs(np.linalg.det(OBLIQUE[:3, :3]))
+    tried: list[tuple[int, float]] = []
+    level = next_level(tried, wanted, -1.0)
+    while all(level != earlier for earlier, _ in tried):
+        vertices, _, triangles = twin.extract_label_mask(labels, OBLIQUE, number, level)
+        tried.append((level, 1000.0 * enclosed_ml(vertices, triangles)))
+        level = next_level(tried, wanted, -wanted / FULL)
+    return level
+
+
 def test_levels_of_two_bodies_side_by_side_are_those_of_the_twin(device):
     labels = np.zeros((14, 15, 34), np.uint8)
     labels[:, :, 2:16][ball_mask((14, 15, 14), 5.2)] = 1
     labels[:, :, 15:29][ball_mask((14, 15, 14), 4.4)] = 2
     meshes = extract_label_masks(LabelMap(labels, OBLIQUE), device=device)
     found = [meshes[number].report["mask_level"] * FULL for number in (1, 2)]
-    expected = [twin.choose_level(labels, OBLIQUE, number) for number in (1, 2)]
+    expected = [choose_level(labels, number) for number in (1, 2)]
     assert found == pytest.approx(expected, abs=LEVELS_OFF)
 
 
