@@ -66,6 +66,12 @@ class MemoryLimits:
             return f"{_mib(self.asked_bytes)} are allowed on {self.label} by {name_parameter('memory')}"
         return f"{self.label} has {_mib(self.device_bytes)}, at most {_mib(self.device_buffer_bytes)} in one buffer"
 
+    def refusal(self, problem: str, advice: str = "") -> DeviceError:
+        """Return the error where room is missing: a failure of the device, unless the user allows too little."""
+        if self.asked_bytes is None:
+            return DeviceFailedError(f"{problem}: {self.describe()}; {advice or 'use another device'}")
+        return DeviceError(f"{problem}: {self.describe()}; {advice or 'allow more'}")
+
 
 def check_memory(memory: int | None) -> None:
     """Refuse a value that is not a byte count of at least 1; None stands for all memory of the device."""

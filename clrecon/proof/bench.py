@@ -261,7 +261,6 @@ def _time_warm(
     runner: _OwnRuns, volume: Volume, level: float, runs: int
 ) -> tuple[dict[str, Any], dict[str, Any] | None]:
     """Spreads of the warm runs and of flying edges, run in turn; the second is None if VTK is not installed."""
-
     try:
         flying_edges = FlyingEdges(volume, usable_cores())
     except ImportError:

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from clrecon import opencl as ocl
-from clrecon.errors import DeviceError, DeviceFailedError
 from clrecon.geometry import Volume
 from clrecon.opencl import Device, Program, Stopwatch
 from clrecon.operators.filters.settings import BilateralSettings, finish_result, inside_level
@@ -225,11 +224,8 @@ def run_bilateral(
     run = _Run(resident, settings, stopwatch or Stopwatch(), progress)
     planned = resident.plan(_BILATERAL, resident.volume.shape_ijk[2], run.needs)
     if planned == 0:
-        limits = resident.limits
-        raise (DeviceFailedError if limits.asked_bytes is None else DeviceError)(
-            f"a slice with the {2 * run.halo} slices around it needs {sum(run.needs(1).values()):,} bytes:"
-            f" {limits.describe()}; {'use another device' if limits.asked_bytes is None else 'allow more'}"
-        )
+        needed = sum(run.needs(1).values())
+        raise resident.limits.refusal(f"a slice with the {2 * run.halo} slices around it needs {needed:,} bytes")
     for attempt in resident.attempts(_BILATERAL, planned, run.warnings):
         with attempt as slices:
             result = run.run(slices)

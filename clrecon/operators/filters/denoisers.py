@@ -17,7 +17,7 @@ from clrecon.geometry.resample import shear_degrees
 from clrecon.opencl import Device
 from clrecon.operators.filters.means import MeansSettings, run_means
 from clrecon.operators.filters.settings import checked_length, report_filter
-from clrecon.operators.resident.device_volume import DeviceVolume, take_volume
+from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.system.arguments import FilterName, explains_arguments
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.packages import import_package, package_of
@@ -111,7 +111,10 @@ def filter_volume(
     nk = source.shape_ijk[2]
     tell("filter", 0, nk)
     if denoiser.package is None:
-        voxels, facts = _run_on_device(denoiser, volume, asked, (device, memory), warnings, tell)
+        with open_volume(volume, device, memory, "a filter") as opened:
+            for attempt in opened.with_fallback():
+                with attempt as (_, warnings):
+                    voxels, facts = denoiser.run(opened, asked, warnings, tell)
     else:
         if device is not None or memory is not None:
             raise UsageError(f"{name} runs on the computer's processor: leave out device and memory")
@@ -121,27 +124,6 @@ def filter_volume(
     tell("filter", nk, nk)
     filtered = report_filter(source, _as_voxels(voxels, source), {"filter": name, **facts}, warnings)
     return filtered if resident is None else resident.follow(filtered)  # type: ignore[return-value]
-
-
-def _run_on_device(
-    denoiser: _Denoiser,
-    volume: Volume | DeviceVolume,
-    asked: dict[str, Any],
-    limits: tuple[Device | str | int | None, int | None],
-    warnings: list[str],
-    tell: Progress,
-) -> tuple[NDArray[Any], dict[str, Any]]:
-    """Run a filter on the device of a volume, or on the one of `limits`, which has the memory too."""
-    resident, is_new = take_volume(volume, *limits, "a filter")
-    try:
-        for attempt in resident.with_fallback():
-            with attempt as (_, notes):
-                result, facts = denoiser.run(resident, asked, notes, tell)
-        warnings.extend(notes)
-        return result, facts
-    finally:
-        if is_new:
-            resident.close()
 
 
 def _check_volume(volume: Volume, name: str, denoiser: _Denoiser) -> None:

@@ -324,7 +324,6 @@ def _fill_spaces(bone: Mask, how: tuple[float, float, bool], lowest_inside: floa
         "open": {kind: spaces.describe(which) for kind, which in kinds.items()},
     }
     del spaces  # its runs take as much memory as the volume, where bone is spongy
-
     ml = slice_voxel_ml(volume)
     bone_ml = _measure_ml(bone, ml)
     joints = find_joints(bone, seal_mm, min(BONE_ML, BONE_SHARE * bone_ml)) & (sealed - bone)

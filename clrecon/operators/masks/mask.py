@@ -343,7 +343,6 @@ class Mask(MaskComponents):
         ni, nj, nk = volume.shape_ijk
         packed = np.zeros((nk, nj, 4 * -(-ni // 32)), np.uint8)
         packed[..., : -(-ni // 8)] = np.packbits(chosen, axis=2, bitorder="little")
-
         for attempt in resident.with_fallback():
             with attempt as (current, _):
                 check_budget(current, mask_bytes(volume.shape_ijk), resident.memory)
@@ -360,7 +359,6 @@ class Mask(MaskComponents):
                 f"no voxel lies in the {name}: the volume runs from ({', '.join(f'{x:.1f}' for x in low)}) to"
                 f" ({', '.join(f'{x:.1f}' for x in high)}) mm"
             )
-
         sizes = mask_bytes(volume.shape_ijk)
         for attempt in resident.with_fallback():
             with attempt as (device, _):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from clrecon import opencl as ocl
-from clrecon.errors import DeviceError, DeviceFailedError, NoSurfaceError, UsageError
+from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.opencl import Device, Program, Stopwatch
 from clrecon.operators.resident.device_volume import DeviceVolume
@@ -135,11 +135,8 @@ def mark_band(
 
     planned = resident.plan(BAND, nk, needs)
     if planned == 0:
-        limits = resident.limits
-        raise (DeviceFailedError if limits.asked_bytes is None else DeviceError)(
-            f"the mask of the voxels and one slice need {sum(needs(1).values()):,} bytes: {limits.describe()};"
-            f" {'use another device' if limits.asked_bytes is None else 'allow more'}"
-        )
+        needed = sum(needs(1).values())
+        raise resident.limits.refusal(f"the mask of the voxels and one slice need {needed:,} bytes")
     run = _Marking(resident, bounds, words, pad, stopwatch, progress)
     for attempt in resident.attempts(BAND, planned):
         with attempt as slices:

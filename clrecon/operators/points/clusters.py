@@ -306,7 +306,6 @@ def _cluster_cloud(
     order, lattice, voxels = _find_numbered(cloud, scan) or _find_listed(cloud, scan)
     request = _Request.of(lattice, eps, min_samples)
     chosen_device = take_device(device) if not isinstance(volume, DeviceVolume) else volume.device
-
     for attempt in with_fallback(chosen_device):
         with attempt as (current, notes):
             stopwatch = Stopwatch()

@@ -101,7 +101,6 @@ def remove_outliers(
     k, warnings = check_neighbours(k, len(points), 2)
     if isinstance(deviations, bool) or not isinstance(deviations, (int, float)) or not 0.0 <= deviations < math.inf:
         raise UsageError(f"deviations are a number from 0 on, usually 1 to 3, not {deviations!r}")
-
     for attempt in ocl.with_fallback(ocl.take_device(device)):
         with attempt as (current, notes):
             stopwatch = Stopwatch()
@@ -204,7 +203,6 @@ def denoise_points(
     points = take_points(cloud)
     k, warnings = check_neighbours(k, len(points), FEWEST_NEIGHBOURS)
     settings = _Settings.checked(k, range_factor, iterations, features, paper)
-
     for attempt in ocl.with_fallback(ocl.take_device(device)):
         with attempt as (current, notes):
             run = _Run(settings, current, memory, progress or ignore_progress)

@@ -337,10 +337,8 @@ class NodeField:
         grid, nodes = self.grid, self.nodes
         bricks_x, bricks_y, bricks_z = nodes.bricks
         rows, words = bricks_y * bricks_z, nodes.brick_words
-        merged_d, bricks_d = (
-            ocl.allocate(self.device, 4 * rows * grid.words),
-            ocl.allocate(self.device, 4 * rows * words),
-        )
+        merged_d = ocl.allocate(self.device, 4 * rows * grid.words)
+        bricks_d = ocl.allocate(self.device, 4 * rows * words)
         self._run(
             "merge_rows", rows * grid.words,
             mask=grid.mask_d, merged=merged_d, ny=grid.shape[1], nz=grid.shape[2], words=grid.words,

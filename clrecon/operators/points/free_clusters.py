@@ -116,7 +116,6 @@ def cluster_free_points(
         facts |= {"clusters": 0, "core_points": 0, "noise_points": n}
         return FreeClusters(np.full(n, -1, np.int32), np.zeros(n, bool), 0, facts, (warning,))
     plan = plan_cells(places, eps)
-
     for attempt in ocl.with_fallback(ocl.take_device(device)):
         with attempt as (current, notes):
             stopwatch = Stopwatch()

@@ -329,7 +329,6 @@ def find_neighbours(
     ocl.check_memory(memory)
     places = take_points(points)
     k, warnings = check_neighbours(k, len(places))
-
     for attempt in ocl.with_fallback(ocl.take_device(device)):
         with attempt as (current, notes):
             results = {"neighbours": 4 * k * len(places), "distances": 4 * k * len(places)}
@@ -338,9 +337,7 @@ def find_neighbours(
             distances, distances_d = ocl.empty_output(current, (len(places), k), np.float32)
             for part in search.each_part("neighbours", progress or ignore_progress):
                 search.find(part, indices_d, distances_d)
-            indices, distances = (
-                ocl.download(current, indices, indices_d),
-                ocl.download(current, distances, distances_d),
-            )
+            indices = ocl.download(current, indices, indices_d)
+            distances = ocl.download(current, distances, distances_d)
             neighbours = Neighbours(indices, distances, (*warnings, *notes))
     return neighbours

@@ -12,7 +12,7 @@ from numpy.typing import DTypeLike, NDArray
 from clrecon import opencl as ocl
 from clrecon.anatomy.head import warn_of_face
 from clrecon.anatomy.iso_choice import settle_level
-from clrecon.errors import DeviceError, DeviceFailedError, DeviceMemoryError, NoSurfaceError, UsageError
+from clrecon.errors import DeviceError, DeviceMemoryError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import data_range, describe_range
 from clrecon.geometry.vertices import find_vertex_origin, warnings_of_far
@@ -138,10 +138,7 @@ class VoxelEmission:
         ni, nj, _ = self.volume.shape_ijk
         slices = self.resident.plan(self.kind, nk, needs, most=max(_MOST_NUMBERS // (ni * nj), 1))
         if slices == 0:
-            raise (DeviceFailedError if limits.asked_bytes is None else DeviceError)(
-                f"one slice needs {sum(self.needs(1).values()):,} bytes, and room for its points: {limits.describe()};"
-                f" {'use another device' if limits.asked_bytes is None else 'allow more'}"
-            )
+            raise limits.refusal(f"one slice needs {sum(self.needs(1).values()):,} bytes, and room for its points")
         return slices
 
     def _go_on(self, slices: int, progress: Progress) -> None:
@@ -390,7 +387,6 @@ def _voxels(
     placed = None if labels is None else resident.bring(labels)
     number = 0 if labels is None or label is None else labels.find(label)
     chosen = Selection(*ends, shell, None if placed is None else placed.voxels, number, paper)
-
     for attempt in resident.with_fallback():
         with attempt as (current, warnings):
             run = VoxelEmission(resident, chosen, warnings=warnings)

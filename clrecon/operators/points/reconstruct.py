@@ -285,7 +285,6 @@ def reconstruct_surface(
     _check_numbers(widenings, {"spacing": spacing, "reach": reach, "smoothing": smoothing, "bridge": bridge})
     mean_mm = _own_spacing(cloud) if spacing is None else float(spacing)
     settings = _choose_lengths(mean_mm, noisy, reach, smoothing, bridge)
-
     for attempt in with_fallback(take_device(device)):
         with attempt as (current, warnings):
             run = _Reconstruction(cloud, normals, settings, current, memory, progress or ignore_progress)

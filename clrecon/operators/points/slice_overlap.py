@@ -71,7 +71,6 @@ def find_ghost_slices(
         No device, no room for the mask, or the device fails.
     """
     band = checked_band(hu)
-
     with open_volume(volume, device, memory, "a search for ghost slices") as resident:
         ni, nj, nk = resident.volume.shape_ijk
         beside = {"counts of rows": 12 * nj * nk}

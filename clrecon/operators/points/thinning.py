@@ -82,7 +82,6 @@ def thin_points(
     if not (isinstance(spacing, (int, float, np.number)) and math.isfinite(spacing) and spacing > 0.0):
         raise UsageError(f"{name_parameter('spacing', spacing)}: a positive length in mm is needed")
     plan, tell = plan_grid(source.points, float(spacing)), progress or ignore_progress
-
     for attempt in ocl.with_fallback(ocl.take_device(device)):
         with attempt as (current, notes):
             stopwatch = Stopwatch()
@@ -250,7 +249,6 @@ def remove_sparse_cells(
     length = choose_edge(source, device=chosen_device, memory=memory) if edge is None else float(edge)
     tell("cells", 1, 2)
     plan = plan_grid(source.points, length)
-
     for attempt in ocl.with_fallback(chosen_device):
         with attempt as (current, notes):
             stopwatch = Stopwatch()

@@ -19,7 +19,7 @@ from clrecon.operators.rays.picture_buffers import highlight_table
 from clrecon.operators.rays.point_pictures import eye_table
 from clrecon.rendering import Lighting
 from clrecon.rendering.pictures.object_looks import MeshLook
-from clrecon.rendering.views.camera import Camera
+from clrecon.rendering.views.camera import Camera, box_between
 from clrecon.system.light_dataclass import dataclass, field
 from clrecon.system.pieces import find_bounds
 from clrecon.system.text import format_digits
@@ -197,9 +197,6 @@ def _camera_planes(camera: Camera, planes: Float64Array) -> NDArray[np.float32]:
 FARTHEST_MM = 1e9
 """Largest coordinate of a vertex, 1000 km as for cameras, so that the product of two coordinates fits float32."""
 
-SMALLEST_SIDE_MM = 1e-3
-"""Least side of the box around an object, so that the camera has a view direction and a height."""
-
 
 def mesh_corners(mesh: Mesh) -> Float64Array:
     """Return the lowest and the highest corner of the box around the triangles of a mesh, (2, 3) in LPS mm."""
@@ -219,12 +216,9 @@ def mesh_corners(mesh: Mesh) -> Float64Array:
 
 
 def box_around(corners: Sequence[Float64Array] | NDArray[np.float64]) -> Grid:
-    """Return the box of points, (n, 3), LPS mm, as a grid of one voxel, which `Camera.fit` places a camera for."""
+    """Return the box of points, (n, 3), LPS mm, see `box_between`."""
     points = np.concatenate([np.atleast_2d(each) for each in corners])
-    low, high = points.min(axis=0), points.max(axis=0)
-    affine = np.diag([*np.maximum(high - low, SMALLEST_SIDE_MM), 1.0])
-    affine[:3, 3] = 0.5 * (low + high)
-    return Grid(np.zeros((1, 1, 1), np.int8), affine)
+    return box_between(points.min(axis=0), points.max(axis=0))
 
 
 def make_part(mesh: Mesh, look: MeshLook) -> MeshPart:

@@ -23,7 +23,7 @@ from clrecon.rendering.looks.colors import find_color
 from clrecon.rendering.looks.window import checked_window, choose_window
 from clrecon.rendering.pictures.label_style import distinct_colors
 from clrecon.rendering.pictures.object_looks import PointLook
-from clrecon.rendering.views.camera import Camera
+from clrecon.rendering.views.camera import Camera, box_between
 from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import Progress, ignore_progress
 
@@ -138,9 +138,6 @@ class _Splats:
         starts, whole_d = range(0, max(n, 1), max(count, 1)), None
         picture: dict[str, Any] = {"view": view_d, "width": width, "height": height}
 
-        def tell_done(done: int) -> None:
-            self.progress("points", done, 3 * n)
-
         def hold(first: int) -> Any:
             nonlocal whole_d
             if len(starts) > 1:
@@ -148,7 +145,7 @@ class _Splats:
             whole_d = _upload(device, points, stopwatch) if whole_d is None else whole_d
             return whole_d
 
-        tell_done(0)
+        self.progress("points", 0, 3 * n)
         with stopwatch.running(device):
             ocl.launch(device, program["clear_splats"], pixels, keys=keys_d, numbers=numbers_d, pixels=pixels)
         for number, kernel in enumerate(("splat_depths", "splat_numbers")):
@@ -161,15 +158,13 @@ class _Splats:
                         points=points_d, keys=keys_d, radius=radius_mm, count=piece, **more, **picture,
                     )  # fmt: skip
                 del points_d
-                tell_done(number * n + first + piece)
+                self.progress("points", number * n + first + piece, 3 * n)
         whole_d = None
         for first in starts:
             piece = min(count, n - first)
             shown = np.zeros(3, np.float32) if self.shading != "normals" else normals[first : first + piece]  # type: ignore[index]
-            normals_d, colors_d = (
-                _upload(device, shown, stopwatch),
-                _upload(device, colors[first : first + piece], stopwatch),
-            )
+            normals_d = _upload(device, shown, stopwatch)
+            colors_d = _upload(device, colors[first : first + piece], stopwatch)
             with stopwatch.running(device):
                 ocl.launch(
                     device, program["shade_splats"], pixels, keys=keys_d, numbers=numbers_d, normals=normals_d,
@@ -177,7 +172,7 @@ class _Splats:
                     shading=_SHADINGS[self.shading], apart=self.apart, first=first, count=piece, **picture,
                 )  # fmt: skip
             del normals_d, colors_d
-            tell_done(2 * n + first + piece)
+            self.progress("points", 2 * n + first + piece, 3 * n)
         with stopwatch.timed("download"):
             ocl.download_all(device, (image, image_d, 0), (depth, depths_d, 0))
         return SplatPicture(image, depth, self.shading, len(starts))
@@ -225,14 +220,11 @@ MOST_NAMED = 24
 """Most entries of a legend; those with the most points."""
 
 
-def cloud_box(cloud: PointCloud, margin: float = 0.0) -> Grid:
-    """Return the box of a cloud, `margin` mm larger on every side, as a grid of one voxel for `Camera.fit`."""
+def cloud_box(cloud: PointCloud) -> Grid:
+    """Return the box of a cloud, see `box_between`."""
     if not len(cloud):
         raise UsageError("the cloud has no points: there is nothing to show")
-    low, high = (np.asarray(end(axis=0), dtype=np.float64) for end in (cloud.points.min, cloud.points.max))
-    affine = np.diag([*np.maximum(high - low + 2.0 * margin, 1e-3), 1.0])
-    affine[:3, 3] = 0.5 * (low + high)
-    return Grid(np.zeros((1, 1, 1), np.int8), affine)
+    return box_between(cloud.points.min(axis=0), cloud.points.max(axis=0))
 
 
 class _Colors(NamedTuple):

@@ -250,7 +250,6 @@ def take_with_layers(
     draw: Callable[[DrawnVolume], Rendering],
 ) -> Rendering:
     """Picture a volume with what lies in it; `draw` is called again where room is short or another device works."""
-
     for attempt in resident.with_fallback():
         with attempt as (device, warnings):
             job = _Job(resident, style, shot, ray_step, warnings)

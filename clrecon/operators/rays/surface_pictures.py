@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.errors import DeviceError, DeviceFailedError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule, choose_iso_rule
 from clrecon.labels.label_levels import Growth
-from clrecon.opencl import launch, memory_limits, upload
+from clrecon.opencl import launch, upload
 from clrecon.operators.rays.openness import Hiding, HollowedPicture
 from clrecon.operators.rays.picture_buffers import PictureBuffers, RayView, Shot, count_queues, highlight_table
 from clrecon.operators.rays.ray_slabs import LeapMap, RaySlab, find_leaps, slab_labels
@@ -70,11 +69,8 @@ class _Job(HollowedPicture):
         resident, nk = self.resident, self.resident.volume.shape_ijk[2]
         if slices < nk:
             if self.look.shadows:
-                limits = memory_limits(resident.device, resident.memory)
-                raise (DeviceFailedError if limits.asked_bytes is None else DeviceError)(
-                    f"shadows need the whole volume on the device, {slices} of its {nk} slices fit:"
-                    f" {limits.describe()}; give more memory or leave the shadows out"
-                )
+                problem = f"shadows need the whole volume on the device, {slices} of its {nk} slices fit"
+                raise resident.limits.refusal(problem, "give more memory or leave the shadows out")
             self._shorten_steps()
         self.find_openness(slices)
         output, slabs = self.draw_slabs(slices)

@@ -146,10 +146,7 @@ class _Run:
         with self.stopwatch.timed("build"):
             program = prepare_reformat(self.device, self.resident.dtype, uneven=self.volume.uneven)
         rows_d, slices_d = ocl.upload(self.device, places.rows), ocl.upload(self.device, places.slices)
-        values_d, weights_d = (
-            ocl.allocate(self.device, 4 * shape[0] * shape[1]),
-            ocl.allocate(self.device, 4 * shape[0] * shape[1]),
-        )
+        values_d, weights_d = (ocl.allocate(self.device, 4 * shape[0] * shape[1]) for _ in range(2))
         count, own_first = 0, places.first
         while count == 0 or own_first < places.end:
             held_end = places.end if takes_whole else min(own_first + slices, places.end)
@@ -207,7 +204,6 @@ def sample_sheet(
     """
     if not isinstance(combine, str) or combine not in COMBINATIONS:
         raise UsageError(f"the samples of a slab are combined by one of {', '.join(COMBINATIONS)}, not {combine!r}")
-
     for attempt in resident.with_fallback():
         with attempt as (_, notes):
             run = _Run(resident, sheet, samples, combine, stopwatch or Stopwatch())

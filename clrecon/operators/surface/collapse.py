@@ -186,7 +186,6 @@ class DeviceCollapser:
             "pair_faces", self._faces, **self._lists, faces_at=faces_at, below=below, faces=self._faces,
             count=self._count,
         )  # fmt: skip
-
         read = self._read
         into, rounds, begin, size = read(self._log["into"], np.int32, self._count, 4).T
         history = History(

@@ -392,7 +392,6 @@ def extract_label_masks(
         raise RefusedInputError("the label map is empty: no voxel has a label")
     marching_cubes.check_row(labels.shape_ijk[0])
     chosen = labels.choose(label)
-
     for attempt in ocl.with_fallback(ocl.take_device(device)):
         with attempt as (current, warnings):
             run = MaskExtraction(labels, current, memory, closed, warnings)

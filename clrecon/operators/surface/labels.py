@@ -395,7 +395,6 @@ def extract_labels(
         rule = choose_iso_rule(resident.volume, level, closed=closed, values=resident.values)
         marching_cubes.check_row(resident.volume.shape_ijk[0])
         growth = Growth.of(resident.volume, grow_mm)
-
         for attempt in resident.with_fallback():
             with attempt as (_, warnings):
                 run = LabelExtraction(resident, placed, rule, growth, solid, warnings)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import cached_property
 
-from clrecon.errors import DeviceError, DeviceFailedError
 from clrecon.geometry import Volume, is_left_handed
 from clrecon.geometry.iso_rule import IsoRule
 from clrecon.operators.primitives.scan import BitRows
@@ -162,9 +161,6 @@ def plan_slabs(grid: SampleGrid, resident: DeviceVolume) -> int:
     slices = resident.plan(grid.kind, gk, needs, counted=(BRICKS,), most=most)
     if slices == 0:
         first = min(2, gk - 1)
-        shortest = Slab(grid, first, first + 1).needs()
-        raise (DeviceFailedError if limits.asked_bytes is None else DeviceError)(
-            f"one slice with its neighbours needs {sum(shortest.values()):,} bytes, and room for its mesh:"
-            f" {limits.describe()}; {'use another device' if limits.asked_bytes is None else 'allow more'}"
-        )
+        needed = sum(Slab(grid, first, first + 1).needs().values())
+        raise limits.refusal(f"one slice with its neighbours needs {needed:,} bytes, and room for its mesh")
     return slices

@@ -252,7 +252,6 @@ def _inside(resident: DeviceVolume, crop: LabelCrop, iso_value: float, grow_mm: 
         )
     if not boxes or not ((placed.voxels == crop.number) & rule.mark_inside(volume.voxels)).any():
         return inside != 0
-
     for attempt in resident.with_fallback():
         with attempt:
             slab = LabelExtraction(resident, placed, rule, growth, True, []).hold(boxes)

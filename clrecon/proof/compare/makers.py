@@ -170,7 +170,6 @@ def _fitted(scene: Scene) -> Product:
 
 
 def _vtk(scene: Scene) -> Product:
-
     request = scene.request
     mesh = extract_by_vtk(scene.volume, request.iso_value, request.method, request.closed)
     return mesh, [mesh.report]
@@ -243,7 +242,6 @@ _MAKERS: dict[str, Callable[[Scene], Product]] = {
 
 def draw(scene: Scene, product: Any, view: str) -> Any:
     """Draw what a method made, before black; `view` is "view" or "along", a name of `Request.views`."""
-
     camera, size = scene.request.views()[view]
     if isinstance(product, Mesh):
         return draw_mesh(product, camera, size, device=scene.device)

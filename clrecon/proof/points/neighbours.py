@@ -32,15 +32,10 @@ def _order(
 ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
     """Sort each row by (distance, number) and return its first `k`."""
     by_number = np.argsort(numbers, axis=1, kind="stable")
-    distances, numbers = (
-        np.take_along_axis(distances, by_number, axis=1),
-        np.take_along_axis(numbers, by_number, axis=1),
-    )
-    nearest = np.argsort(distances, axis=1, kind="stable")[:, :k]
-    return (
-        np.take_along_axis(numbers, nearest, axis=1).astype(np.int32),
-        np.take_along_axis(distances, nearest, axis=1),
-    )
+    by_distance = np.argsort(np.take_along_axis(distances, by_number, axis=1), axis=1, kind="stable")
+    nearest = np.take_along_axis(by_number, by_distance[:, :k], axis=1)
+    ordered = np.take_along_axis(numbers, nearest, axis=1).astype(np.int32)
+    return ordered, np.take_along_axis(distances, nearest, axis=1)
 
 
 def find_neighbours(points: NDArray[np.float32], k: int) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
@@ -174,13 +169,9 @@ def cell_factors(
     factors = np.zeros(len(points))
     order = np.argsort(cells, kind="stable")
     for in_cell in np.split(order, np.flatnonzero(np.diff(cells[order])) + 1):
-        among = np.broadcast_to(in_cell, (len(in_cell), len(in_cell)))
-        away = points[in_cell][:, None].astype(np.float64) - points.astype(np.float64)[among]
-        heights = np.einsum("nki,ni->nk", away, normals[in_cell])
-        moves = (sigma_s[in_cell] >= _LEAST_RANGE_MM) & (sigma_c[in_cell] > 0.0)
-        far, high = np.where(moves, sigma_c[in_cell], 1.0)[:, None], np.where(moves, sigma_s[in_cell], 1.0)[:, None]
-        weights = np.exp(-np.einsum("nki,nki->nk", away, away) / (2.0 * far**2) - heights**2 / (2.0 * high**2))
-        factors[in_cell] = np.where(moves, (weights * heights).sum(axis=1) / weights.sum(axis=1), 0.0)
+        among = np.tile(np.arange(len(in_cell)), (len(in_cell), 1))
+        of_cell = (array[in_cell] for array in (sigma_c, sigma_s))
+        factors[in_cell] = bilateral_factors(points[in_cell], normals[in_cell], among, *of_cell)
     return factors
 
 

@@ -162,7 +162,6 @@ def _check_tiles(device: Device) -> str:
             entries = download(device, np.empty((nj, ni), np.float32), entries_d) + view.table[-1, 0]
         heights = volume.slice_origins()[:, 2]
         first, last = (heights[np.maximum(stair - n, 0)] + distance for n in (_BEFORE, 0))
-
         allowed = 0.5 * (last - first)
         subject = f"entries of tiles{' of uneven slices' if uneven else ''}"
         require_close((entries - 0.5 * (first + last)) / allowed, np.zeros_like(entries), 1.0, subject)

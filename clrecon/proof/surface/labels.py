@@ -118,7 +118,6 @@ def extract_label_mask(
     within = np.pad(np.ones(labels.shape, dtype=bool), border)
     leads_out = ~(within[edges.near] & within[edges.far])
     grown = np.pad(labels.astype(np.int64), border, mode="edge")
-
     occupancy = (FULL // 4096) * find_occupancy(labels == number)
     everyone = (FULL // 4096) * find_occupancy(labels != 0)
     values = [np.pad(field, border, mode="edge") for field in (occupancy, everyone)]
@@ -136,7 +135,6 @@ def extract_label_mask(
     value = np.where(starts, np.maximum(value, level + 1), np.minimum(value, level - 1))
     next_value = np.where(starts, np.minimum(next_value, level - 1), np.maximum(next_value, level + 1))
     t = (level - value) / (next_value - value)
-
     between = ~leads_out & (grown[edges.near] != 0) & (grown[edges.far] != 0)
     biases = level_biases(dict(enclosed or {}), int(labels.max()) + 1)[grown]
     before = biases[edges.near] - biases[edges.far]
@@ -146,7 +144,6 @@ def extract_label_mask(
     t[leads_out] = 0.5
     keep = np.maximum(extract.edge_margins(volume, rule, edges), KEEP)
     t = np.clip(t, keep, 1.0 - keep)
-
     takes = (alongside & ~between)[:, None]
     slope, next_slope = (np.where(takes, slopes[1][e], slopes[0][e]) for e in (edges.near, edges.far))
     slope, next_slope = (1.0 - t[:, None]) * slope, t[:, None] * next_slope

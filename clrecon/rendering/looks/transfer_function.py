@@ -341,7 +341,6 @@ class TransferFunction(Message):
             head["lighting"] = {key: value for key, value in asdict(self.lighting).items() if value is not None}
         gradient = None if self.gradient_opacity is None else self.gradient_opacity.tolist()
         text = transfer_text(head, self.points.tolist(), gradient).encode("utf-8")
-
         with keep_existing(keep=no_clobber):
             replace_file(path, lambda stream: stream.write(text))
 

@@ -222,7 +222,6 @@ class Rendering(PictureData):
         OutputError
             The file cannot be written; an older file of that name is intact.
         """
-
         with keep_existing(keep=no_clobber):
             return _replace_image(path, encode_image(self, check_image_path(path, has_vectors=True), quality))
 
@@ -243,7 +242,6 @@ class Rendering(PictureData):
         int
             Size of the file in bytes.
         """
-
         with keep_existing(keep=no_clobber):
             return write_floats(self.expected_depth if expected else self.depth, path, self.pixel_mm)
 
@@ -256,7 +254,6 @@ class Rendering(PictureData):
         UsageError
             The mode has no values.
         """
-
         if self.values is None:
             having = "mip, minip, mean, drr, slice and cpr"
             raise UsageError(f"a picture of mode {self.mode} has no values: {having} have them")

@@ -14,7 +14,7 @@ from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array, map_points
 from clrecon.geometry.grid import Grid
 from clrecon.geometry.volume import Volume
-from clrecon.rendering.views.camera import box_corners
+from clrecon.rendering.views.camera import box_between, box_corners
 from clrecon.rendering.views.directions import checked_vector
 from clrecon.system.base_classes import Message
 
@@ -126,10 +126,6 @@ class Clip(Message):
         return f"Clip({self._planes.tolist()})"
 
 
-SMALLEST_SIDE_MM = 1e-3
-"""Least side of a box, so that its affine can be inverted."""
-
-
 class ShownLabels(NamedTuple):
     """Labels on the grid of a volume, (nk, nj, ni), and for each number whether its voxels are shown."""
 
@@ -183,11 +179,7 @@ def find_seen_box(
         if abs(normal[axis]) > 1.0 - 1e-12:
             low[axis] = max(low[axis], offset) if normal[axis] > 0 else low[axis]
             high[axis] = min(high[axis], -offset) if normal[axis] < 0 else high[axis]
-    if (high < low).any():
-        return None
-    affine = np.diag([*np.maximum(high - low, SMALLEST_SIDE_MM), 1.0])
-    affine[:3, 3] = 0.5 * (low + high)
-    return Grid(np.zeros((1, 1, 1), np.int8), affine)
+    return None if (high < low).any() else box_between(low, high)
 
 
 def check_center(center: object, shown: Grid) -> tuple[float, float, float]:

@@ -238,10 +238,8 @@ def straightened_sheet(
     rights = np.cos(turn) * normals + np.sin(turn) * binormals
     depths = np.cross(rights, tangents)  # into the picture
     turned = np.radians(angle)
-    rights, depths = (
-        np.cos(turned) * rights + np.sin(turned) * depths,
-        np.cos(turned) * depths - np.sin(turned) * rights,
-    )
+    c, s = np.cos(turned), np.sin(turned)
+    rights, depths = c * rights + s * depths, c * depths - s * rights
     arc = _row_places(curve.length, height, pixel)
     within = (arc >= 0.0) & (arc <= curve.length)
     tangent = curve.tangents(arc)
