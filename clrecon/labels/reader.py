@@ -92,7 +92,7 @@ def read_labels(
         not say where it lies in space, or has segments that overlap.
     """
     wanted = check_wanted(label)
-    labels = _read_map(path, Wanted(wanted, others=False), volume, follow_links, progress)
+    labels = _read_map(path, Wanted(wanted, others=False), volume, follow_links, progress or ignore_progress)
     return labels if wanted is None else _keep(labels, [labels.find(label) for label in wanted])
 
 
@@ -102,10 +102,9 @@ def read_all_labels(
     *,
     volume: Grid | None = None,
     follow_links: bool = False,
-    progress: Progress | None = None,
 ) -> LabelMap:
     """Read a label map with all labels, which tell a surface where its own ends; `first` get voxels of several."""
-    return _read_map(path, Wanted(check_wanted(first)), volume, follow_links, progress)
+    return _read_map(path, Wanted(check_wanted(first)), volume, follow_links, ignore_progress)
 
 
 def _keep(labels: LabelMap, numbers: Sequence[int]) -> LabelMap:
@@ -118,7 +117,7 @@ def _keep(labels: LabelMap, numbers: Sequence[int]) -> LabelMap:
 
 
 def _read_map(
-    path: str | Path, wanted: Wanted, volume: Grid | None, follow_links: bool, progress: Progress | None
+    path: str | Path, wanted: Wanted, volume: Grid | None, follow_links: bool, progress: Progress
 ) -> LabelMap:
     refuse_url(path, "label map")
     path = Path(path)
@@ -135,7 +134,7 @@ def _read_map(
         reader: Callable[..., LabelMap] = partial(_read_grid, kind)
         if kind in ("folder", "DICOM"):
             reader = _read_dicom if kind == "DICOM" else partial(_read_folder, follow_links)
-        labels = reader(path, wanted, volume, progress or ignore_progress)
+        labels = reader(path, wanted, volume, progress)
     except OSError as error:
         raise RefusedInputError(f"{escape_text(path.name)} cannot be read: {error.strerror or error}") from error
     if not labels.numbers and wanted.labels is not None:

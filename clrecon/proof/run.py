@@ -12,14 +12,13 @@ import json
 import os
 import queue
 import signal
-import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
-from typing import IO, Any
+from typing import Any
 
-from clrecon.errors import ClreconError, DeviceError
+from clrecon.errors import ClreconError
 from clrecon.opencl import Device, choose_unchecked, list_devices
 from clrecon.proof.checking import Check
 from clrecon.proof.points import cloud_checks, voxel_checks
@@ -27,6 +26,7 @@ from clrecon.proof.rays import layer_checks, ray_checks
 from clrecon.proof.surface import decimation_checks, surface_checks
 from clrecon.proof.timing import usable_cores
 from clrecon.proof.volumes import volume_checks
+from clrecon.system.processes import start_with
 from clrecon.system.progress import Progress, device_seconds, ignore_progress
 from clrecon.system.records import name_schema
 
@@ -138,27 +138,10 @@ class _Child:
         self._doing = "its start"
         self._since = time.perf_counter()
         self._silent = 0.0
-        if getattr(sys, "frozen", False) or not sys.executable:
-            raise DeviceError("the self-test needs a Python interpreter to start, and this program has none")
-        try:
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", "clrecon.proof.run"],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-                creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
-            )
-        except OSError as error:
-            raise DeviceError(f"no process can be started for the self-test: {error.strerror or error}") from error
-        assert self._process.stdin is not None and self._process.stdout is not None
         request = {"device": device.index, "checks": [check.name for check in checks]}
-        try:
-            self._process.stdin.write(json.dumps(request).encode())
-            self._process.stdin.close()
-        except OSError:  # it has ended already: `results` tells
-            pass
+        self._process = start_with(("-m", "clrecon.proof.run"), "kernels are checked", request)
         self._lines: queue.Queue[bytes] = queue.Queue()
-        threading.Thread(target=self._read, args=(self._process.stdout,), daemon=True).start()
+        threading.Thread(target=self._read, daemon=True).start()
 
     def __enter__(self) -> _Child:
         return self
@@ -170,8 +153,8 @@ class _Child:
         self._process.kill()
         self._process.wait()
 
-    def _read(self, stream: IO[bytes]) -> None:
-        for line in stream:
+    def _read(self) -> None:
+        for line in self._process.stdout or ():
             self._lines.put(line)
         self._lines.put(b"")
 

@@ -374,7 +374,8 @@ _ENCODERS = {
 def find_encoder(extension: str = ".mp4") -> str:
     """Return the ffmpeg to call for a kind of video: that of imageio-ffmpeg, else the one on the PATH."""
     program, (encoder, name, _) = _find_ffmpeg(), _ENCODERS[extension]
-    kind, advice = extension[1:].upper(), _advise_encoder(encoder)
+    kind = extension[1:].upper()
+    advice = f"{install_command('imageio-ffmpeg')}, or put an ffmpeg with {encoder} on the PATH"
     if program is None:
         raise UsageError(f"no encoder for {kind}: {advice}; GIF, APNG and a folder of PNG files need none")
     try:
@@ -384,10 +385,6 @@ def find_encoder(extension: str = ".mp4") -> str:
     if f" {encoder} ".encode() not in listed:
         raise UsageError(f"{program} has no {name} encoder ({encoder}): {advice}")
     return program
-
-
-def _advise_encoder(encoder: str) -> str:
-    return f"{install_command('imageio-ffmpeg')}, or put an ffmpeg with {encoder} on the PATH"
 
 
 def _find_ffmpeg() -> str | None:

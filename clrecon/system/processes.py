@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import atexit
+import json
 import os
 import signal
 import subprocess
 import sys
 import threading
 from collections.abc import Mapping, Sequence
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from clrecon.errors import DeviceError
 
@@ -46,6 +47,18 @@ def start_python(
         )
     except OSError as error:
         raise DeviceError(f"{subject} in processes, and none can be started: {error.strerror or error}") from error
+
+
+def start_with(command: Sequence[str], subject: str, data: Mapping[str, Any]) -> subprocess.Popen[bytes]:
+    """Start this Python, see `start_python`, with a JSON object as all of its input."""
+    process = start_python(command, subject)
+    assert process.stdin is not None
+    try:
+        process.stdin.write(json.dumps(data).encode())
+        process.stdin.close()
+    except OSError:  # it has ended already: its answer is missing
+        pass
+    return process
 
 
 def share_machine(devices: Sequence[str | None], number: int) -> tuple[dict[str, str], list[int] | None]:

@@ -124,6 +124,12 @@ def join_names(names: Iterable[object], most: int = _NAMES_SHOWN) -> str:
     return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
 
 
+def list_names(names: Iterable[str]) -> str:
+    """List all names in words: ``a``, ``a and b``, ``a, b and c``; empty without any."""
+    *first, last = list(names) or [""]
+    return " and ".join(filter(None, (", ".join(first), last)))
+
+
 def to_hexadecimal(rgb: Iterable[float]) -> str:
     """Return a colour of red, green and blue, 0 to 1, as ``#rrggbb``."""
     return "#" + "".join(f"{round(255 * min(max(float(share), 0.0), 1.0)):02x}" for share in rgb)

@@ -49,11 +49,7 @@ class Scanned:
     total: int
 
 
-def prepare_scan(device: Device) -> None:
-    _load_scan(device)
-
-
-def _load_scan(device: Device) -> Program:
+def prepare_scan(device: Device) -> Program:
     return load_program(device, "primitives/scan.cl", {"SCAN_GROUP": str(device.group_size)})
 
 
@@ -73,7 +69,7 @@ def _check_size(n: int) -> None:
 def enqueue_scan(device: Device, counts_d: Any, offsets_d: Any, n: int) -> Any:
     """Enqueue the same into offsets, or the counts, and wait for nothing; return the exact total, (1,) uint64."""
     _check_size(n)
-    scan = _load_scan(device)
+    scan = prepare_scan(device)
     blocks = -(-n // (SCAN_PER_ITEM * device.group_size))
     sums_d, block_offsets_d = allocate(device, 4 * blocks), allocate(device, 4 * blocks)
     total_d = allocate(device, 8)
@@ -101,12 +97,8 @@ class Compacted:
     count: int
 
 
-def prepare_compact(device: Device) -> None:
+def prepare_compact(device: Device) -> Program:
     prepare_scan(device)
-    _load_compact(device)
-
-
-def _load_compact(device: Device) -> Program:
     return load_program(device, "primitives/compact.cl")
 
 
@@ -114,7 +106,7 @@ def compact(device: Device, mask_d: Any, words: int) -> Compacted:
     """Find the set bits of a mask, (words,) uint32, words 1 to 2^27; bit b of word w is position ``32 * w + b``."""
     if not 1 <= words <= _LARGEST_MASK:
         raise UsageError(f"{words:,} words: a mask has 1 to {_LARGEST_MASK:,}, so that positions fit 32 bits")
-    program = _load_compact(device)
+    program = prepare_compact(device)
     chunks = -(-words // COMPACT_WORDS)
     counts_d = allocate(device, 4 * chunks)
     launch(device, program["count_set_bits"], chunks, mask=mask_d, counts=counts_d, words=words)

@@ -45,6 +45,7 @@ from clrecon.rendering.views.reformation import find_plane
 from clrecon.system.arguments import DirectionName, ModeName, ViewName, explains_arguments
 from clrecon.system.light_dataclass import replace
 from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.text import list_names
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack  # of Python 3.11
@@ -393,5 +394,5 @@ def _check_alone(**placing: Any) -> None:
     """Refuse parameters that place a camera if a camera is given."""
     given = [name for name, value in placing.items() if value is not None]
     if given:
-        them = " and ".join(filter(None, (", ".join(given[:-1]), given[-1])))
-        raise UsageError(f"a camera says by itself where a picture is taken from: leave out {them}, or the camera")
+        names = list_names(given)
+        raise UsageError(f"a camera says by itself where a picture is taken from: leave out {names}, or the camera")

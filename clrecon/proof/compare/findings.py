@@ -9,6 +9,7 @@ from typing import Any
 
 from clrecon.jobs.run import RunReport
 from clrecon.system.records import Record
+from clrecon.system.text import list_names
 
 
 def seconds(value: float) -> str:
@@ -47,11 +48,6 @@ def ratio(value: float) -> str:
     if value >= 10.0:
         return f"{value:,.0f}"
     return f"{value:.1f}" if math.isfinite(value) else "many"
-
-
-def join(names: list[str]) -> str:
-    """Join names: ``a``, ``a and b``, ``a, b and c``."""
-    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1]))) if names else ""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -161,7 +157,7 @@ def find_findings(methods: Sequence[MethodRecord], reference: str, *, with_truth
     lines += _of_truth(done) if with_truth else ()
     missing = [method.title for method in methods if not method.is_done]
     if missing:
-        lines.append(f"{join(missing)} did not run: the table says why.")
+        lines.append(f"{list_names(missing)} did not run: the table says why.")
     return lines
 
 
@@ -203,11 +199,11 @@ def _of_same(done: Rows, reference: str) -> Iterator[str]:
         return
     if same:
         give = "gives" if len(same) == 1 else "give"
-        yield f"{join([m.title for m in same])} {give} the surface of {reference_row.title}, to 0.001 mm."
+        yield f"{list_names([m.title for m in same])} {give} the surface of {reference_row.title}, to 0.001 mm."
     if near:
         far = max(m.surfaces["hd95_mm"] for m in near if m.surfaces)
         yield (
-            f"{join([m.title for m in near])} pass{'es' if len(near) == 1 else ''} through the same cells as"
+            f"{list_names([m.title for m in near])} pass{'es' if len(near) == 1 else ''} through the same cells as"
             f" {reference_row.title} and divide{'s' if len(near) == 1 else ''} them into other triangles: HD95 up to"
             f" {far:.3f} mm."
         )

@@ -15,9 +15,10 @@ from typing import Any
 
 from clrecon.proof.compare.child import LONG_SECONDS
 from clrecon.proof.compare.figures import COLORS, Figures, embed
-from clrecon.proof.compare.findings import CompareReport, MethodRecord, join, seconds, share
+from clrecon.proof.compare.findings import CompareReport, MethodRecord, seconds, share
 from clrecon.proof.compare.records import ALL_PARTS
 from clrecon.proof.compare.table import main_table, paper_table, shown_columns, small_table
+from clrecon.system.text import list_names
 
 
 def _read_text(name: str) -> str:
@@ -342,7 +343,7 @@ def _slices(report: CompareReport, figures: Figures) -> str:
     colors = {titles[name]: COLORS[name] for name in titles if name in drawn and name not in figures.same}
     reference = titles[report.reference]
     if figures.same and reference in colors:
-        also = join([titles[name] for name in titles if name in figures.same])
+        also = list_names(titles[name] for name in titles if name in figures.same)
         colors = {f"{title} (and {also})" if title == reference else title: color for title, color in colors.items()}
     tiles = []
     for entry in report.slices:

@@ -8,7 +8,7 @@ import json
 import queue
 import subprocess
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -20,7 +20,7 @@ from clrecon.geometry import Volume
 from clrecon.mesh import Mesh
 from clrecon.proof.timing import usable_cores
 from clrecon.rendering.views.camera import Camera
-from clrecon.system.processes import describe_end, start_python
+from clrecon.system.processes import describe_end, start_with
 
 _VOXELS, _PLACE = "voxels.npy", "place.npz"
 
@@ -95,24 +95,14 @@ def load_mesh(folder: Path, name: str) -> Mesh | None:
 
 _METHOD = ("-m", "clrecon.proof.compare.child")
 _JUDGE = ("-m", "clrecon.proof.compare.judge")
+_SUBJECT = "methods are compared"
 
 _MOST_JUDGES = 4
 
 
-def _start_process(command: Sequence[str], data: Mapping[str, Any]) -> subprocess.Popen[bytes]:
-    process = start_python(command, "methods are compared")
-    assert process.stdin is not None
-    try:
-        process.stdin.write(json.dumps(data).encode())
-        process.stdin.close()
-    except OSError:  # it has ended already: its answer is missing
-        pass
-    return process
-
-
 def run_in_process(request: Request) -> dict[str, Any]:
     """Run a method in a process of its own, and return what `clrecon.proof.compare.child.run_method` tells."""
-    process = _start_process(_METHOD, request.as_dict())
+    process = start_with(_METHOD, _SUBJECT, request.as_dict())
     assert process.stdout is not None
     try:
         answer = process.stdout.read()
@@ -135,7 +125,7 @@ def measure_in_processes(data: Mapping[str, Any], methods: Mapping[str, int]) ->
     processes: list[subprocess.Popen[bytes]] = []
     try:
         for number, part in enumerate(parts):
-            process = _start_process(_JUDGE, {**data, "methods": part})
+            process = start_with(_JUDGE, _SUBJECT, {**data, "methods": part})
             processes.append(process)
             threading.Thread(target=_forward, args=(number, process.stdout, lines), daemon=True).start()
         running = len(processes)

@@ -68,12 +68,8 @@ def make_record(
         cells_visited=cells.get("visited"),
         cells_all=cells.get("all"),
         growing=result.get("growing"),
-        quality=measured.get("quality"),
-        cells=measured.get("cells"),
-        slices=measured.get("slices"),
-        surfaces=measured.get("surfaces"),
-        truth=measured.get("truth"),
         points_mm=measured.get("points"),
+        **{name: measured.get(name) for name in ("quality", "cells", "slices", "surfaces", "truth")},
         reasons=measured.get("reasons", {}),
         small=_facts_of_small(method, result),
     )

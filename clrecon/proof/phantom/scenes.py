@@ -29,14 +29,6 @@ from clrecon.system.progress import Progress
 Float64Array = NDArray[np.float64]
 
 
-class Piece:
-    """A piece with its own box, drawn only in slices that meet the box."""
-
-    def __init__(self, center: Float64Array, axes: Float64Array, low: Float64Array, high: Float64Array):
-        self.center, self.axes = center, axes
-        self.corners = center + np.array(list(itertools.product(*zip(low, high, strict=True)))) @ axes
-
-
 class Window:
     """The part of a slice in which a piece lies, with the coordinates there."""
 
@@ -50,11 +42,15 @@ class Window:
 
 
 class PlacedPiece:
-    """A part with its box in indices and its local affine."""
+    """A piece, from `low` to `high` in its own frame, with its box in indices and its local affine."""
 
-    def __init__(self, part: Piece, affine: Float64Array, shape_kji: tuple[int, int, int]):
+    def __init__(
+        self, center: Float64Array, axes: Float64Array, low: Float64Array, high: Float64Array, affine: Float64Array,
+        shape_kji: tuple[int, int, int],
+    ):  # fmt: skip
         inverse = np.linalg.inv(affine)
-        ijk = part.corners @ inverse[:3, :3].T + inverse[:3, 3]
+        corners = center + np.array(list(itertools.product(*zip(low, high, strict=True)))) @ axes
+        ijk = corners @ inverse[:3, :3].T + inverse[:3, 3]
         self.low = np.floor(ijk.min(axis=0)).astype(int)
         self.high = np.ceil(ijk.max(axis=0)).astype(int) + 1
         nk, nj, ni = shape_kji
@@ -63,16 +59,16 @@ class PlacedPiece:
             slice(min(max(self.low[0], 0), ni), max(min(self.high[0], ni), 0)),
         )
         self.local = np.eye(4)
-        self.local[:3, :3] = part.axes @ affine[:3, :3]
-        self.local[:3, 3] = part.axes @ (affine[:3, 3] - part.center)
+        self.local[:3, :3] = axes @ affine[:3, :3]
+        self.local[:3, 3] = axes @ (affine[:3, 3] - center)
 
     def meets(self, k: int) -> bool:
-        """True where slice k can hold some of the part."""
+        """True where slice k can hold some of the piece."""
         rows, columns = self.region
         return bool(self.low[2] <= k < self.high[2]) and rows.start < rows.stop and columns.start < columns.stop
 
     def window(self, k: float) -> Window:
-        """Return the window of the part, with its coordinates, in (sub-)slice k."""
+        """Return the window of the piece, with its coordinates, in (sub-)slice k."""
         return Window(self.region, self.local, k)
 
 
@@ -149,9 +145,7 @@ def draw_scene(
     subslices = int(np.clip(round(dk / math.sqrt(di * dj)), 1, 4))
     ramp = (di * dj * dk / subslices) ** (1.0 / 3.0)
     margin = np.full(3, 2.0 * ramp + float(np.linalg.norm(grid[:3, :3], axis=0).max()))
-    placed = [
-        PlacedPiece(Piece(np.array(p.center), p.axes, p.low - margin, p.high + margin), grid, shape) for p in parts
-    ]
+    placed = [PlacedPiece(np.array(p.center), p.axes, p.low - margin, p.high + margin, grid, shape) for p in parts]
     voxels, labels = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.uint8)
     offsets = (np.arange(subslices) + 0.5) / subslices - 0.5
     for k in range(shape[0]):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from clrecon.geometry import column_spacing
 from clrecon.proof.phantom.fields import Field, capsule, coverage, ellipse, ellipsoid, waves_at
-from clrecon.proof.phantom.scenes import Part, Piece, PlacedPiece, Plan, Window, lay_under, paint
+from clrecon.proof.phantom.scenes import Part, PlacedPiece, Plan, Window, lay_under, paint
 from clrecon.proof.phantom.settings import CENTRE_LPS_MM, PhantomSettings
 from clrecon.proof.phantom.spine_parts import Anatomy, Vertebra, level_number
 from clrecon.proof.phantom.spine_plan import plan_anatomy
@@ -228,7 +228,7 @@ class _Scene:
         margin = np.full(3, 2.0 * ramp_mm + float(np.linalg.norm(affine[:3, :3], axis=0).max()))
 
         def place_piece(center: Float64Array, axes: Float64Array, low: Float64Array, high: Float64Array) -> PlacedPiece:
-            return PlacedPiece(Piece(center, axes, low - margin, high + margin), affine, shape_kji)
+            return PlacedPiece(center, axes, low - margin, high + margin, affine, shape_kji)
 
         self.discs = []
         for disc in anatomy.discs:
@@ -318,7 +318,7 @@ def label_levels(settings: PhantomSettings, affine: Float64Array) -> NDArray[np.
     labels = np.zeros(settings.shape_kji, dtype=np.uint8)
     for vertebra in anatomy.vertebrae:
         low, high = (np.array(corner) for corner in local_bounds(vertebra))
-        placed = PlacedPiece(Piece(vertebra.center, vertebra.axes, low, high), grid, settings.shape_kji)
+        placed = PlacedPiece(vertebra.center, vertebra.axes, low, high, grid, settings.shape_kji)
         for k in range(settings.slices):
             if placed.meets(k):
                 window = placed.window(float(k))

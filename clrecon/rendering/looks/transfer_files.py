@@ -14,6 +14,7 @@ import math
 import os
 import stat
 from collections.abc import Callable, Collection, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 from xml.parsers import expat
@@ -334,12 +335,11 @@ def _name_of_node(value: Any, field: str) -> str:
 
 def read_slicer_json(value: Any) -> list[Entry]:
     """Read a .vp.json file; of each property only the first component."""
-    properties = take_list(value["volumeProperties"], "volumeProperties")
-
-    def entry(n: int) -> Entry:
-        return _name_of_node(properties[n], "name"), lambda: _json_parameters(properties[n], f"volumeProperties[{n}]")
-
-    return [entry(n) for n in range(len(properties))]
+    name = "volumeProperties"
+    return [
+        (_name_of_node(node, "name"), partial(_json_parameters, node, f"{name}[{n}]"))
+        for n, node in enumerate(take_list(value[name], name))
+    ]
 
 
 def _paraview_parameters(value: Any, path: str) -> dict[str, Any]:
@@ -366,11 +366,10 @@ def _paraview_parameters(value: Any, path: str) -> dict[str, Any]:
 
 def read_paraview_json(value: list[Any]) -> list[Entry]:
     """Read a list of ParaView's colour maps with opacities; positions are HU."""
-
-    def entry(n: int) -> Entry:
-        return _name_of_node(value[n], "Name"), lambda: _paraview_parameters(value[n], f"map {n + 1}")
-
-    return [entry(n) for n in range(len(take_list(value, "the file")))]
+    return [
+        (_name_of_node(node, "Name"), partial(_paraview_parameters, node, f"map {n}"))
+        for n, node in enumerate(take_list(value, "the file"), start=1)
+    ]
 
 
 def _refuse_constant(name: str) -> NoReturn:

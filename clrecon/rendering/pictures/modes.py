@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from itertools import chain
 from typing import Literal, NamedTuple, TypedDict
@@ -31,7 +31,7 @@ from clrecon.rendering.views.centre_line import Curve
 from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.directions import hint_at_sheet
 from clrecon.system.arguments import Combination, CurvedKind, ModeName, PresetName, WindowName, name_parameter
-from clrecon.system.text import unknown_name
+from clrecon.system.text import list_names, unknown_name
 
 
 class Mode(NamedTuple):
@@ -197,15 +197,8 @@ def find_style(style: Style | str | None, look: Mapping[str, object]) -> Style:
     """Return a given style unchanged, or make the one that a mode and keywords ask for."""
     if isinstance(style, Style):
         if look:
-            raise UsageError(
-                f"a style says by itself what a picture shows: leave out {_join_names(look)}, or the style"
-            )
+            raise UsageError(f"a style says by itself what a picture shows: leave out {list_names(look)}, or the style")
         return style
     if style is not None and "mode" in look:
         raise UsageError(f"the mode is given twice, as {style!r:.60} and as {look['mode']!r:.60}")
     return make_style(**({} if style is None else {"mode": style}), **look)  # type: ignore[arg-type]
-
-
-def _join_names(names: Iterable[str]) -> str:
-    *first, last = names
-    return " and ".join(filter(None, (", ".join(first), last)))
