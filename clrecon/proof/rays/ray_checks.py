@@ -13,22 +13,11 @@ from numpy.typing import NDArray
 from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
 from clrecon.opencl import Device, Stopwatch, download, upload
+from clrecon.operators.rays import ray_slabs as slabs
 from clrecon.operators.rays.openness import Hiding, find_openness
 from clrecon.operators.rays.picture_buffers import TILE, PictureBuffers, RayView, Shot
 from clrecon.operators.rays.point_pictures import Discs, draw_splats
 from clrecon.operators.rays.ray_pictures import MainWay, enter_tiles, look_ahead, take_picture
-from clrecon.operators.rays.ray_slabs import (
-    BRICK_CELLS,
-    FARTHEST,
-    GROWN,
-    LeapMap,
-    RaySlab,
-    Smoothing,
-    find_leaps,
-    measure_cells,
-    ray_slabs,
-    smooth_voxels,
-)
 from clrecon.operators.rays.slices import overlay_slices
 from clrecon.operators.rays.surface_pictures import cast_surface
 from clrecon.operators.resident.device_volume import DeviceVolume
@@ -60,7 +49,7 @@ from clrecon.rendering.views.clip import Clip
 _LEAP_SHAPE = (185, 193, 17)
 """Voxels (k, j, i) of 46 x 48 x 4 bricks: four rows of bricks a work-item are more than 500."""
 
-_BEFORE = 5 * BRICK_CELLS
+_BEFORE = 5 * slabs.BRICK_CELLS
 """Slices before the first bright one within which a tile may begin: bricks around it, and rays aside of the middle."""
 
 TYPES = ("int16", "uint8", "float32")
@@ -69,19 +58,19 @@ TYPES = ("int16", "uint8", "float32")
 def _count_cells(voxels: NDArray[Any], take: np.ufunc) -> NDArray[Any]:
     """Reduce the voxels around the cells of each brick: bricks share the voxels between them."""
     for axis in range(3):
-        starts = np.arange(0, voxels.shape[axis] - 1, BRICK_CELLS)
-        ends = np.take(voxels, np.minimum(starts + BRICK_CELLS, voxels.shape[axis] - 1), axis=axis)
+        starts = np.arange(0, voxels.shape[axis] - 1, slabs.BRICK_CELLS)
+        ends = np.take(voxels, np.minimum(starts + slabs.BRICK_CELLS, voxels.shape[axis] - 1), axis=axis)
         voxels = take(take.reduceat(voxels, starts, axis=axis), ends)
     return voxels
 
 
 def _spread_bricks(shown: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """Return the Chebyshev distance of each brick to the nearest that shows, at most `FARTHEST`."""
-    distances = np.where(shown, 0, FARTHEST).astype(np.uint8)
+    distances = np.where(shown, 0, slabs.FARTHEST).astype(np.uint8)
     for axis in range(3):
         lines = np.moveaxis(distances, axis, 0)
         best = lines.copy()
-        for step in range(1, FARTHEST):
+        for step in range(1, slabs.FARTHEST):
             for target, source in ((np.s_[step:], np.s_[:-step]), (np.s_[:-step], np.s_[step:])):
                 best[target] = np.minimum(best[target], np.maximum(lines[source], step))
         distances = np.moveaxis(best, 0, axis)
@@ -98,16 +87,16 @@ def _count_ahead(distances: NDArray[np.uint8], ray: MainWay) -> NDArray[np.uint8
         drift = np.where(np.abs(offset) <= ray.aside, 0, np.sign(offset)).astype(int)
         clear = clear & np.take(clear, np.clip(numbers + drift, 0, len(numbers) - 1), axis=axis)
     lines = np.moveaxis(clear, ray.axis, 0)
-    counts, count = np.zeros(lines.shape, np.uint8), np.full(lines.shape[1:], FARTHEST)
+    counts, count = np.zeros(lines.shape, np.uint8), np.full(lines.shape[1:], slabs.FARTHEST)
     for n in range(len(lines))[:: -ray.ahead]:
-        count = np.where(lines[n], np.minimum(count + 1, FARTHEST), 0)
+        count = np.where(lines[n], np.minimum(count + 1, slabs.FARTHEST), 0)
         counts[n] = count
     return np.moveaxis(counts, 0, ray.axis).T
 
 
-def _open_slab(device: Device, volume: Volume) -> tuple[DeviceVolume, RaySlab]:
+def _open_slab(device: Device, volume: Volume) -> tuple[DeviceVolume, slabs.RaySlab]:
     resident = DeviceVolume(volume, device=device)
-    return resident, next(ray_slabs(resident, volume.shape_ijk[2], np.inf, Stopwatch()))
+    return resident, next(slabs.ray_slabs(resident, volume.shape_ijk[2], np.inf, Stopwatch()))
 
 
 def _check_leaps(device: Device) -> str:
@@ -120,8 +109,8 @@ def _check_leaps(device: Device) -> str:
         counts = slab.bricks[::-1]
         with stopwatch.running(device):
             ranges = np.empty((*counts, 2), dtype)
-            download(device, ranges, measure_cells(resident, slab))
-            leaps = find_leaps(resident, slab, "key", np.arange(100) > 50, 0.0, 1.0)
+            download(device, ranges, slabs.measure_cells(resident, slab))
+            leaps = slabs.find_leaps(resident, slab, "key", np.arange(100) > 50, 0.0, 1.0)
             distances = download(device, np.empty(counts, np.uint8), leaps.distances_d)
         low, high = _count_cells(voxels, np.minimum), _count_cells(voxels, np.maximum)
         require_equal(ranges, np.stack([low, high], axis=-1), f"ranges of bricks of {dtype} voxels")
@@ -131,11 +120,11 @@ def _check_leaps(device: Device) -> str:
             for axis in range(3):
                 main_way = MainWay(axis, 1 if axis else -1, np.array(eye, np.float32), aside)
                 with stopwatch.running(device):
-                    known = LeapMap(upload(device, expected), None)
+                    known = slabs.LeapMap(upload(device, expected), None)
                     ways_d = look_ahead(resident, slab, main_way, known)
                     ways = download(device, np.empty(counts, np.uint8), ways_d)
                 require_equal(ways >> 4, _count_ahead(expected, main_way), f"free bricks ahead along axis {axis}")
-                require_equal(ways & FARTHEST, expected, "distances of bricks, copied")
+                require_equal(ways & slabs.FARTHEST, expected, "distances of bricks, copied")
     return f"{np.prod(counts):,} bricks of {len(TYPES)} types of voxels equal"
 
 
@@ -157,7 +146,7 @@ def _check_tiles(device: Device) -> str:
         view = RayView.of(volume, camera, size, 0.5, box=box, focus=box)
         output = PictureBuffers(device, size, None, False)
         with stopwatch.running(device):
-            leaps = find_leaps(resident, slab, "key", np.arange(100) > 50, 0.0, 0.1)
+            leaps = slabs.find_leaps(resident, slab, "key", np.arange(100) > 50, 0.0, 0.1)
             entries_d = enter_tiles(resident, slab, view, leaps, output)
             entries = download(device, np.empty((nj, ni), np.float32), entries_d) + view.table[-1, 0]
         heights = volume.slice_origins()[:, 2]
@@ -177,10 +166,10 @@ def _check_smoothing(device: Device) -> str:
     for dtype in TYPES:
         voxels = rng.normal(100.0, 30.0, _SMOOTHED_SHAPE).astype(dtype)
         resident, slab = _open_slab(device, stack(voxels, np.diag([0.7, 0.9, 2.0, 1.0])))
-        smoothing = Smoothing.of(resident.volume, 1.3)
+        smoothing = slabs.Smoothing.of(resident.volume, 1.3)
         assert smoothing is not None
         with stopwatch.running(device):
-            smoothed = download(device, np.empty_like(voxels), smooth_voxels(resident, slab, smoothing))
+            smoothed = download(device, np.empty_like(voxels), slabs.smooth_voxels(resident, slab, smoothing))
         require_equal(smoothed, smooth_field(resident.volume, 1.3), f"smoothed {dtype} voxels")
     return f"{len(TYPES)} x {voxels.size:,} voxels smoothed along three axes, the same bits"
 
@@ -320,7 +309,7 @@ def _check_composite_labels(device: Device) -> str:
         picture = take_picture(DeviceVolume(volume, device=device), style, Shot(camera, SIZE), 0.3)
         require_whole(picture.report)
         pixels = np.arange(SIZE[0])
-        grown = [(pixels >= 32) & (pixels % 32 < GROWN), (pixels % 32 >= 8 - GROWN) & (pixels % 32 < 8)]
+        grown = [(pixels >= 32) & (pixels % 32 < slabs.GROWN), (pixels % 32 >= 8 - slabs.GROWN) & (pixels % 32 < 8)]
         column = np.select(grown, [3, 1], pixels // 8 % 4)
         factor = np.choose(column, (1.0, 0.25, 1.0, 0.5))
         opacity = 1.0 - (1.0 - 0.1 * factor) ** (10 * 0.5 / grey.unit_distance)

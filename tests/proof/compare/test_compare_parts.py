@@ -29,7 +29,6 @@ from clrecon.proof.compare.findings import (
     count,
     find_findings,
     find_worse,
-    join,
     megabytes,
     milliseconds,
     ratio,
@@ -42,6 +41,7 @@ from clrecon.proof.compare.makers import extract_by_vtk
 from clrecon.proof.compare.methods import COMPARED, choose_methods
 from clrecon.proof.compare.processes import Request, load_mesh, load_volume, save_mesh, save_volume
 from clrecon.proof.compare.records import make_record
+from clrecon.system.text import list_names
 
 pytestmark = pytest.mark.first_device
 
@@ -340,7 +340,7 @@ def test_number_of_a_comparison_is_written_with_the_digits_of_its_kind(write: An
     ("names", "text"), [([], ""), (["a"], "a"), (["a", "b"], "a and b"), (["a", "b", "c"], "a, b and c")]
 )
 def test_names_are_joined_with_commas_and_a_last_and(names: list[str], text: str) -> None:
-    assert join(names) == text
+    assert list_names(names) == text
 
 
 def test_chosen_methods_are_in_the_order_of_the_table_with_the_reference() -> None:
