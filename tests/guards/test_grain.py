@@ -12,7 +12,7 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 101_907,
+    "lines": 101_682,
     "modules": 440,
     "small_modules_with_one_reader": 7,
     "docstrings_with_raises": 139,
@@ -23,7 +23,7 @@ CEILINGS = {
 
 HABITS = {
     "functions_with_pronouns": 26,
-    "functions_without_object": 45,
+    "functions_without_object": 44,
     "assignments_of_three": 19,
     "nested_conditionals": 0,
     "comprehensions_of_two_loops": 23,

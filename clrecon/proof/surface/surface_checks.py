@@ -100,7 +100,7 @@ def _check_first_and_second(device: Device) -> str:
 
 def _check_variant(
     device: Device, levels: tuple[Level, ...], make: Callable[[tuple[int, int, int], str], NDArray[Any]] = waves,
-    shape: tuple[int, int, int] = WIDE, uneven: bool = False, types: tuple[str, ...] = ("int16", "float32"),
+    shape: tuple[int, int, int] = WIDE, types: tuple[str, ...] = ("int16", "float32"), *, uneven: bool = False,
     **options: Any,
 ) -> str:  # fmt: skip
     worst = 0.0
