@@ -15,7 +15,7 @@ from clrecon.opencl import Device, Stopwatch, check_budget, upload
 from clrecon.operators.masks import voxel_mask
 from clrecon.operators.masks.regions import RowSpans, box_spans, checked_box, tube_spans
 from clrecon.operators.masks.runs import Components, RowRuns, write_runs
-from clrecon.operators.masks.shapes import MaskComponents
+from clrecon.operators.masks.shapes import MaskBits
 from clrecon.operators.masks.voxel_mask import check_shape, checked_band, mark_band, mask_bytes, zero_words
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.system.arguments import explains_arguments
@@ -28,7 +28,7 @@ if TYPE_CHECKING:  # label maps load pydicom, which others need not wait for
     from clrecon.mesh import Mesh
 
 
-class Mask(MaskComponents):
+class Mask(MaskBits):
     """Voxels of a volume that are chosen: one bit each, on a device, in the frame of the volume.
 
     Make one by `from_band`, `from_labels`, `from_box`, `from_tube` or `from_array`.  Masks of one volume are joined by

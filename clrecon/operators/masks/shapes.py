@@ -286,15 +286,10 @@ class MaskBits:
         if away > PLACE_TOLERANCE_MM:
             raise UsageError(f"the voxels of the mask and of the other volume lie up to {format_digits(away)} mm apart")
 
-
-Shapes = TypeVar("Shapes", bound="MaskShapes")
-
-
-class MaskShapes(MaskBits):
-    """A mask that is changed by balls; what `clrecon.Mask` is made of."""
+    # Balls
 
     @explains_arguments
-    def dilate(self: Shapes, mm: float, *, by_slice: bool = False) -> Shapes:
+    def dilate(self: Bits, mm: float, *, by_slice: bool = False) -> Bits:
         """Choose all voxels within a distance of a chosen voxel.
 
         The distance is that of the voxels' centres in the patient: the result is that of a distance transform in mm
@@ -306,7 +301,7 @@ class MaskShapes(MaskBits):
         return self._made(self._spread(mm, by_slice), f"({self.name}) dilated by {mm:g} mm")
 
     @explains_arguments
-    def erode(self: Shapes, mm: float, *, by_slice: bool = False) -> Shapes:
+    def erode(self: Bits, mm: float, *, by_slice: bool = False) -> Bits:
         """Choose the voxels that have no other voxel than chosen ones within a distance.
 
         Nothing beyond the volume is chosen, so that what reaches its border is eroded from there too.
@@ -316,7 +311,7 @@ class MaskShapes(MaskBits):
         return self._made(self._erode(mm, by_slice), f"({self.name}) eroded by {mm:g} mm")
 
     @explains_arguments
-    def open(self: Shapes, mm: float, *, by_slice: bool = False) -> Shapes:
+    def open(self: Bits, mm: float, *, by_slice: bool = False) -> Bits:
         """Erode, then dilate: all balls of this radius that fit into what is chosen and into the volume.
 
         mm, by_slice: As for `dilate`.
@@ -325,7 +320,7 @@ class MaskShapes(MaskBits):
         return self._made(eroded._spread(mm, by_slice), f"({self.name}) opened by {mm:g} mm")
 
     @explains_arguments
-    def close(self: Shapes, mm: float, *, by_slice: bool = False) -> Shapes:
+    def close(self: Bits, mm: float, *, by_slice: bool = False) -> Bits:
         """Dilate, then erode: gaps into which no ball of this radius fits are filled.
 
         What lies beyond the volume counts as chosen for the erosion, so that all that was chosen stays.
@@ -336,7 +331,7 @@ class MaskShapes(MaskBits):
         return self._made(dilated._spread(mm, by_slice, erode=True, beyond=True), f"({self.name}) closed by {mm:g} mm")
 
     @explains_arguments
-    def dilate_within(self: Shapes, room: Shapes, mm: float) -> Shapes:
+    def dilate_within(self: Bits, room: Bits, mm: float) -> Bits:
         """Choose the voxels of another mask that short ways over faces of its voxels join with chosen ones.
 
         A way takes a step along i, j or k at a time; along each axis it may be as long as `mm`, in whole steps rounded
@@ -375,26 +370,10 @@ class MaskShapes(MaskBits):
         ocl.check_budget(self.device, needs, self.memory)
         return spread_bits(self.device, self.bits, ball, erode=erode, beyond=beyond)
 
-
-def _cross_of(volume: Volume, axes: NDArray[np.bool_]) -> Stencil:
-    """Return the neighbours of a voxel by its faces along some of the axes i, j, k, and itself."""
-    rows = [[0, 0, -int(axes[0]), int(axes[0])]]
-    rows += [[step, 0, 0, 0] for step in (-1, 1) if axes[1]] + [[0, step, 0, 0] for step in (-1, 1) if axes[2]]
-    nk = volume.shape_ijk[2]
-    tables = np.tile(np.array([[0, len(rows)]], np.int32), (nk, 1))
-    in_plane = 1 + 2 * int(axes[0]) + 2 * int(axes[1])
-    members = in_plane + 2 * int(axes[2])
-    return Stencil(np.array(rows, np.int32), tables, in_plane, (members, members), int(axes[0]))
-
-
-ComponentMask = TypeVar("ComponentMask", bound="MaskComponents")
-
-
-class MaskComponents(MaskShapes):
-    """A mask whose components are looked at; what `clrecon.Mask` is made of."""
+    # Components
 
     @explains_arguments
-    def fill_holes(self: ComponentMask, *, by_slice: bool = False) -> ComponentMask:
+    def fill_holes(self: Bits, *, by_slice: bool = False) -> Bits:
         """Choose the voxels that chosen ones enclose too.
 
         Enclosed is what no way over faces of voxels that are not chosen joins with the border of the volume.
@@ -413,7 +392,7 @@ class MaskComponents(MaskShapes):
             runs.write_runs(self.device, holes, marks_d, filled_d, self.shape_ijk, wanted=0)
         return self._made(filled_d, f"({self.name}) with holes filled" + " slice by slice" * by_slice)
 
-    def grow(self: ComponentMask, points_mm: ArrayLike) -> ComponentMask:
+    def grow(self: Bits, points_mm: ArrayLike) -> Bits:
         """Choose the components that hold a point: chosen voxels joined with it by faces of chosen voxels.
 
         points_mm: array_like, shape (n, 3) or (3,). LPS mm; each belongs to the voxel whose centre is nearest along
@@ -436,7 +415,7 @@ class MaskComponents(MaskShapes):
         return self._made(grown_d, f"({self.name}) grown from {len(points)} point{'s' * (len(points) != 1)}")
 
     @explains_arguments
-    def components(self: ComponentMask, most: int = 100) -> list[ComponentMask]:
+    def components(self: Bits, most: int = 100) -> list[Bits]:
         """Return the components as masks, the largest first: chosen voxels that are joined by faces of chosen voxels.
 
         Parameters
@@ -449,7 +428,7 @@ class MaskComponents(MaskShapes):
         return [self._choose(parts, largest[n : n + 1], f"component {n + 1}") for n in range(len(largest))]
 
     @explains_arguments
-    def keep_largest(self: ComponentMask, count: int = 1) -> ComponentMask:
+    def keep_largest(self: Bits, count: int = 1) -> Bits:
         """Return the `count` largest components in one mask; joined as in `components`."""
         parts, sizes = self._measure_components(count)
         label = "the largest component" if count == 1 else f"the {count} largest components"
@@ -464,7 +443,7 @@ class MaskComponents(MaskShapes):
             return parts, np.empty(0)
         return parts, runs.RunList.read(self.device, parts, self.shape_ijk).sum_ml(self.scan, parts.count)
 
-    def _choose(self: ComponentMask, parts: runs.Components, numbers: NDArray[np.integer], label: str) -> ComponentMask:
+    def _choose(self: Bits, parts: runs.Components, numbers: NDArray[np.integer], label: str) -> Bits:
         chosen_d = zero_words(self.device, mask_bytes(self.shape_ijk)["mask of the voxels"] // 4)
         if len(numbers):
             marks = np.zeros(4 * -(-parts.count // 4), np.uint8)
@@ -492,3 +471,14 @@ class MaskComponents(MaskShapes):
         if np.isfinite(least):
             near = f"the nearest voxel that is chosen ({self.name}) is {least:.1f} mm away"
         return f"the point ({position}) mm {problem}: {near}"
+
+
+def _cross_of(volume: Volume, axes: NDArray[np.bool_]) -> Stencil:
+    """Return the neighbours of a voxel by its faces along some of the axes i, j, k, and itself."""
+    rows = [[0, 0, -int(axes[0]), int(axes[0])]]
+    rows += [[step, 0, 0, 0] for step in (-1, 1) if axes[1]] + [[0, step, 0, 0] for step in (-1, 1) if axes[2]]
+    nk = volume.shape_ijk[2]
+    tables = np.tile(np.array([[0, len(rows)]], np.int32), (nk, 1))
+    in_plane = 1 + 2 * int(axes[0]) + 2 * int(axes[1])
+    members = in_plane + 2 * int(axes[2])
+    return Stencil(np.array(rows, np.int32), tables, in_plane, (members, members), int(axes[0]))

@@ -191,7 +191,7 @@ class VoxelEmission:
 
     def _mark(self, voxels_d: Any, begin: int, stop: int, layout: dict[str, int]) -> tuple[Any, Any, int | None]:
         """Mark the voxels of the band, of the label; with a label or a shell also count those of the band."""
-        device, _stopwatch = self.resident.device, self.stopwatch
+        device = self.resident.device
         ni, nj, nk = self.volume.shape_ijk
         chosen, words = self.selection, layout["words"]
         rows = (stop - begin) * nj
@@ -223,7 +223,7 @@ class VoxelEmission:
 
     def _count(self, mask_d: Any, extents_d: Any, layout: dict[str, int]) -> tuple[Any, int]:
         """Count the voxels of a mask in the slab's own rows; return the number before each row, and all."""
-        device, _stopwatch = self.resident.device, self.stopwatch
+        device = self.resident.device
         program = prepare_voxels(device, self.volume.voxels.dtype)
         rows = layout["rows"]
         counts_d = ocl.allocate(device, 4 * rows)

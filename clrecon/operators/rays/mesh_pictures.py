@@ -154,7 +154,7 @@ class Triangles:
 
     def draw(self, layer: LayerKeys, finds_numbers: bool) -> None:
         """Bring depths, or numbers where all depths are known, to the pixels of a layer, without a wait."""
-        device, _stopwatch = self.device, self.stopwatch
+        device = self.device
         common: dict[str, Any] = {
             **self._picture, **layer.arguments, "planes": self._planes_d, "plane_count": len(self.part.planes),
             "first": self.first, "finds_numbers": finds_numbers,

@@ -41,6 +41,26 @@ SAMPLES_A_LAUNCH = 1 << 28
 systems stop kernels that block a display for seconds.  Cards of their own are faster, and take eight times as many."""
 
 
+def light_row(light: Lighting) -> tuple[float, float, float, float]:
+    """Return the unit vector towards a fixed light, and 1; zeros for a headlight."""
+    return (0.0, 0.0, 0.0, 0.0) if light.direction is None else (*light.direction, 1.0)
+
+
+def describe_picture(
+    mode: str, device: Device, stopwatch: Stopwatch, warnings: Sequence[str], **facts: Any
+) -> dict[str, Any]:
+    """Return the report of a picture, with `facts` in the middle; the device's own warnings come first."""
+    return {
+        "mode": mode,
+        "device": device.label,
+        "driver": device.driver,
+        **facts,
+        "seconds": dict(stopwatch.seconds),
+        "kernel_seconds": dict(stopwatch.by_kernel),
+        "warnings": [*device.warnings, *warnings],
+    }
+
+
 @dataclass(frozen=True)
 class RayView:
     """The rays of a picture for a device: a table, (rows, 4) float32, with `planes` rows of clip planes at its end.
@@ -109,20 +129,11 @@ class RayView:
             directions = (forward + corner, pixel * right, -pixel * up)
             origins = (position + near * directions[0], near * directions[1], near * directions[2])
         light = Lighting() if lighting is None else lighting
-        toward = np.zeros(3) if light.direction is None else np.array(light.direction) / np.linalg.norm(light.direction)
-        rows = [
-            frame.matrix @ origins[0] + frame.offset,
-            frame.matrix @ origins[1],
-            frame.matrix @ origins[2],
-            *(frame.matrix @ direction for direction in directions),
-            *directions,
-            *box,
-            *focus,
-            *normal_matrix(volume.affine),
-        ]
+        begin, *steps = [frame.matrix @ vector for vector in (*origins, *directions)]
+        rows = [begin + frame.offset, *steps, *directions, *box, *focus, *normal_matrix(volume.affine)]
         table = np.zeros((len(rows) + 3, 4))
         table[: len(rows), :3] = rows
-        table[-3] = (*toward, 0.0 if light.direction is None else 1.0)
+        table[-3] = light_row(light)
         table[-2] = light.ambient, light.diffuse, light.specular, light.specular_power
         table[-1] = near, ray_step, max(light.soft_gradient, LEAST_SOFT_GRADIENT) ** 2, 0.0
         count = 0

@@ -14,7 +14,7 @@ from clrecon.errors import DeviceMemoryError, UsageError
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.grid import Grid
 from clrecon.opencl import Device, Stopwatch
-from clrecon.operators.rays.picture_buffers import Shot, highlight_table
+from clrecon.operators.rays.picture_buffers import Shot, describe_picture, highlight_table, light_row
 from clrecon.operators.resident.device_volume import DeviceWorker
 from clrecon.points import PointCloud
 from clrecon.points.spacing import mean_spacing
@@ -193,13 +193,11 @@ def eye_table(camera: Camera, size: tuple[int, int], lighting: Lighting, base: F
     width, height = size
     position = np.array(camera.position) - base
     rows = [(*axis, -(axis @ position)) for axis in camera.basis()]
-    fixed = lighting.direction is not None
-    toward = np.zeros(3) if lighting.direction is None else np.array(lighting.direction)
     return np.array(
         [
             *rows,
             (2.0 * camera.half_height() / height, 0.5 * width, 0.5 * height, float(not camera.is_parallel)),
-            (*(toward / (np.linalg.norm(toward) if fixed else 1.0)), float(fixed)),
+            light_row(lighting),
             (lighting.ambient, lighting.diffuse, lighting.specular, lighting.specular_power),
         ],
         dtype=np.float32,
@@ -284,22 +282,11 @@ class PointPictures(DeviceWorker):
         for attempt in ocl.with_fallback(self._device):
             with attempt as (device, notes):
                 splats = draw_splats(device, discs, shot, memory=self.memory, stopwatch=stopwatch)
-        report = {
-            "mode": "points",
-            "device": device.label,
-            "driver": device.driver,
-            "points": len(points),
-            "radius_mm": radius,
-            "color_by": colors.color_by,
-            "legend": colors.legend,
-            "legend_left_out": colors.left_out,
-            "window_hu": colors.window,
-            "shading": splats.shading,
-            "slabs": splats.parts,
-            "seconds": dict(stopwatch.seconds),
-            "kernel_seconds": dict(stopwatch.by_kernel),
-            "warnings": [*device.warnings, *notes, *_warn_of_radius(radius, camera, size)],
-        }
+        report = describe_picture(
+            "points", device, stopwatch, [*notes, *_warn_of_radius(radius, camera, size)],
+            points=len(points), radius_mm=radius, color_by=colors.color_by, legend=colors.legend,
+            legend_left_out=colors.left_out, window_hu=colors.window, shading=splats.shading, slabs=splats.parts,
+        )  # fmt: skip
         return Rendering(splats.image, splats.depth, splats.depth, camera, None, "points", report)
 
     def _radius(self, style: PointLook) -> float:

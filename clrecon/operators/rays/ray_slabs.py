@@ -17,7 +17,7 @@ from clrecon.geometry.affine import Float64Array
 from clrecon.labels import ResampledLabels
 from clrecon.labels.label_levels import Growth
 from clrecon.opencl import Stopwatch, allocate, check_budget, download, kernel_constant, launch, load_program, upload
-from clrecon.operators.rays.picture_buffers import PictureBuffers, Shot
+from clrecon.operators.rays.picture_buffers import PictureBuffers, Shot, describe_picture
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.tables import BOX_BORDER, enclose, label_variants, voxel_variants
 from clrecon.rendering import Rendering
@@ -428,15 +428,5 @@ class SlabPicture(ABC):
         return output, number
 
     def describe(self, mode: str, slabs: int, **facts: Any) -> dict[str, Any]:
-        device = self.resident.device
-        return {
-            "mode": mode,
-            "device": device.label,
-            "driver": device.driver,
-            **facts,
-            "ray_step_mm": self.ray_step,
-            "slabs": slabs,
-            "seconds": dict(self.stopwatch.seconds),
-            "kernel_seconds": dict(self.stopwatch.by_kernel),
-            "warnings": [*device.warnings, *self.warnings],
-        }
+        facts |= {"ray_step_mm": self.ray_step, "slabs": slabs}
+        return describe_picture(mode, self.resident.device, self.stopwatch, self.warnings, **facts)

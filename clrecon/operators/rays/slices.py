@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
-from clrecon.geometry import Volume
+from clrecon.geometry import Volume, slice_normal
 from clrecon.geometry.affine import Float64Array
 from clrecon.opencl import Stopwatch, check_budget, kernel_constant, launch, load_program, upload
 from clrecon.operators.rays.picture_buffers import (
@@ -21,6 +21,7 @@ from clrecon.operators.rays.picture_buffers import (
     RayView,
     Shot,
     count_queues,
+    describe_picture,
 )
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.tables import FieldFrame, volume_box, voxel_variants
@@ -123,8 +124,7 @@ def _sort_slices(volume: Volume, camera: Camera, chosen: Sequence[int]) -> list[
 
 
 def _heights(volume: Volume, points: Float64Array) -> Float64Array:
-    normal = np.cross(volume.affine[:3, 0], volume.affine[:3, 1])
-    return np.asarray(points @ (normal / np.linalg.norm(normal)), dtype=np.float64)
+    return np.asarray(points @ slice_normal(volume.affine), dtype=np.float64)
 
 
 def _warn_of_edge(volume: Volume, camera: Camera) -> list[str]:
@@ -182,17 +182,10 @@ class _Overlay:
             self.shot.progress("slabs", min((number + 1) * slices, len(self.order)), len(self.order))
         with stopwatch.timed("download"):
             image, late = output.download_image()
-        report = {
-            "mode": "slices",
-            "device": device.label,
-            "driver": device.driver,
-            "slices": self.chosen,
-            "slice_opacity": self.style.opacity,
-            "lowest_shown_hu": self.style.lowest_hu,
-            "seconds": dict(stopwatch.seconds),
-            "kernel_seconds": dict(stopwatch.by_kernel),
-            "warnings": [*device.warnings, *self.warnings],
-        }
+        report = describe_picture(
+            "slices", device, stopwatch, self.warnings,
+            slices=self.chosen, slice_opacity=self.style.opacity, lowest_shown_hu=self.style.lowest_hu,
+        )  # fmt: skip
         return Rendering.with_late_depths(late, image, self.view.camera, None, "slices", report)
 
     def _draw(self, part: Sequence[int], stage: int, output: PictureBuffers, between: Between | None = None) -> None:

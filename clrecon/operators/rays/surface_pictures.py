@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.geometry import Volume
+from clrecon.geometry import Volume, slice_normal
 from clrecon.geometry.iso_rule import IsoRule, choose_iso_rule
 from clrecon.labels.label_levels import Growth
 from clrecon.opencl import launch, upload
@@ -151,8 +151,7 @@ class _Job(HollowedPicture):
         """Return field coordinates per mm towards the fixed light, and whether it throws shadows."""
         if self.look.light.direction is None:
             return _float4()
-        light = np.array(self.look.light.direction)
-        return _float4(*(self.frame.matrix @ (light / np.linalg.norm(light))), float(self.look.shadows))
+        return _float4(*(self.frame.matrix @ self.look.light.direction), float(self.look.shadows))
 
     def _cue(self) -> NDArray[np.float32]:
         """Return the depth of full brightness, 1 / mm from it to the farthest corner, and the brightness lost there."""
@@ -191,6 +190,5 @@ def _field_heights(volume: Volume, frame: FieldFrame, ks: Sequence[float]) -> li
 
 def _slices_per_mm(volume: Volume) -> float:
     """Return the most slices that a ray crosses in a mm."""
-    origins = volume.slice_origins(border=1)
-    normal = np.cross(volume.affine[:3, 0], volume.affine[:3, 1])
-    return float(1.0 / np.abs(np.diff(origins @ (normal / np.linalg.norm(normal)))).min())
+    heights = volume.slice_origins(border=1) @ slice_normal(volume.affine)
+    return float(1.0 / np.abs(np.diff(heights)).min())

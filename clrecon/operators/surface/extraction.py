@@ -20,8 +20,8 @@ from clrecon.opencl import Device, Program, Stopwatch, result_pages
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.tables import BrickRanges, BrickStates, brick_bytes, compare_bricks, measure_bricks
 from clrecon.operators.surface import marching_cubes
-from clrecon.operators.surface.growing import Grown, grow, growing_needs, join_slabs, prepare_growing
-from clrecon.operators.surface.marching_cubes import Classified, Counted, Placement, count
+from clrecon.operators.surface.growing import Grown, grow_runs, growing_needs, join_slabs, prepare_growing
+from clrecon.operators.surface.marching_cubes import Classified, Counted, Placement, count_output
 from clrecon.operators.surface.seeds import Seeds
 from clrecon.operators.surface.slabs import BRICKS, SampleGrid, Slab, plan_slabs
 from clrecon.operators.surface.trilinear import check_row, prepare_trilinear
@@ -282,7 +282,7 @@ class Extraction:
             classified = join_slabs(
                 self.resident, self.grid, ((slab, self._classify(slab, *self._bring(slab))) for slab in slabs)
             )
-            self._grown = grow(self.resident, self.grid, classified, seeds)
+            self._grown = grow_runs(self.resident, self.grid, classified, seeds)
 
     def _bring(self, slab: Slab) -> tuple[Any, marching_cubes.Classifier]:
         """Return the slab's voxels on the device, and its samples, which a card has marked as their voxels came."""
@@ -329,9 +329,9 @@ class Extraction:
                 classified = self._classify(slab, voxels_d, classifier)
             if self._seeds is not None:
                 if self._grown is None:
-                    self._grown = grow(self.resident, self.grid, classified, self._seeds)
+                    self._grown = grow_runs(self.resident, self.grid, classified, self._seeds)
                 classified = self._grown.part(classified, slab.first)
-            counted = count(device, slab, classified, voxels_d)
+            counted = count_output(device, slab, classified, voxels_d)
         return replace(counted, triangles=0) if self._vertices_only else counted, voxels_d
 
     def _compare_bricks(self, slab: Slab, voxels_d: Any) -> BrickStates | None:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from clrecon import opencl as ocl
 from clrecon.errors import DeviceMemoryError, NoSurfaceError, UsageError
+from clrecon.geometry import slice_normal
 from clrecon.geometry.iso_rule import data_range, describe_range
 from clrecon.opencl import Device, Program, Stopwatch
 from clrecon.operators.primitives.scan import enqueue_scan, exclusive_scan, prepare_scan
@@ -49,8 +50,7 @@ def _look_for_cell(
     """Return the cell and how far it is; cells farther than `reach` may be missed."""
     volume, (gi, gj, gk) = grid.volume, grid.shape
     border = grid.rule.border
-    normal = np.cross(volume.affine[:3, 0], volume.affine[:3, 1])
-    heights = np.abs((volume.slice_origins(border) - point) @ (normal / np.linalg.norm(normal)))
+    heights = np.abs((volume.slice_origins(border) - point) @ slice_normal(volume.affine))
     near = np.flatnonzero(heights <= reach)
     if not len(near):
         return None
@@ -337,7 +337,7 @@ def join_slabs(resident: DeviceVolume, grid: SampleGrid, slabs: Iterator[tuple[S
     return Classified(mask_d, extents_d)
 
 
-def grow(resident: DeviceVolume, grid: SampleGrid, classified: Classified, seeds: Seeds) -> Grown:
+def grow_runs(resident: DeviceVolume, grid: SampleGrid, classified: Classified, seeds: Seeds) -> Grown:
     """Find the components of active cells that hold a seed, from the inside mask of the whole grid, without waiting."""
     search = _Search(resident, grid, classified)
     runs = search.find_runs()

@@ -38,7 +38,7 @@ from clrecon.operators.resident.tables import label_variants
 from clrecon.operators.surface import marching_cubes
 from clrecon.operators.surface.extraction import Part
 from clrecon.operators.surface.labels import ExtractionByLabel
-from clrecon.operators.surface.marching_cubes import Counted, Placement, count
+from clrecon.operators.surface.marching_cubes import Counted, Placement, count_output
 from clrecon.operators.surface.slabs import SampleGrid
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.light_dataclass import dataclass, replace
@@ -248,7 +248,7 @@ class MaskExtraction(ExtractionByLabel[HeldMap, tuple[Part, int]]):
                 map=slab.map_d, mask=classified.mask_d, row_extents=classified.row_extents_d, label=number,
                 begin_j=box[1].start, end_j=box[1].stop, **window.arguments,
             )  # fmt: skip
-            counted = count(device, window, classified)
+            counted = count_output(device, window, classified)
         self.check_output(window, counted)
         emission = marching_cubes.Emission(device, surface, slab.occupancy_d, counted, self.placement, stopwatch)
         with stopwatch.running(device):

@@ -23,7 +23,7 @@ from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.operators.resident.tables import label_variants, voxel_variants
 from clrecon.operators.surface import marching_cubes
 from clrecon.operators.surface.extraction import Part, voxel_level
-from clrecon.operators.surface.marching_cubes import Classified, Counted, Placement, count
+from clrecon.operators.surface.marching_cubes import Classified, Counted, Placement, count_output
 from clrecon.operators.surface.slabs import SampleGrid, Slab
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.light_dataclass import dataclass
@@ -267,7 +267,7 @@ class LabelExtraction(ExtractionByLabel[HeldSlices, "Part | None"]):
                 device, label_program["classify_label"], window.mask_rows, inside=slab.inside_d, mask=classified.mask_d,
                 row_extents=classified.row_extents_d, half_way_count=half_way_d, label=number, **window.arguments,
             )  # fmt: skip
-            counted = count(device, window, classified)
+            counted = count_output(device, window, classified)
         if counted.triangles == 0:
             return None
         self.check_output(window, counted)

@@ -142,7 +142,7 @@ def list_output(device: Device, counted: Counted) -> OutputList:
     return OutputList(vertices_d, vertex_blocks_d, triangles_d, triangle_blocks_d)
 
 
-def count(device: Device, slab: Slab, classified: Classified, voxels_d: Any = None) -> Counted:
+def count_output(device: Device, slab: Slab, classified: Classified, voxels_d: Any = None) -> Counted:
     """Passes 2 to 4: count vertices and triangles, find where those of each word begin, and which words have any.
 
     The topology of the trilinear field needs slices ``slab.voxel_slices`` of the volume.
