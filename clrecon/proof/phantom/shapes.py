@@ -8,8 +8,9 @@ The body of a phantom is sized for its field of view, with its centre a part of 
 
 from __future__ import annotations
 
+import abc
 import math
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,33 +20,6 @@ from clrecon.geometry import apply_affine
 from clrecon.proof.phantom.settings import PhantomSettings
 
 Float64Array = NDArray[np.float64]
-
-
-class Body(Protocol):
-    """A solid with an exact signed distance."""
-
-    def signed_distance(self, points_mm: ArrayLike) -> Float64Array:
-        """Distance in mm to the surface, positive inside; points (n, 3) LPS mm, result (n,) float64."""
-        ...
-
-    @property
-    def area_mm2(self) -> float:
-        """Area of the surface in mm2, infinite for an unbounded body."""
-        ...
-
-    @property
-    def volume_ml(self) -> float:
-        """Volume in ml (1000 mm3), infinite for an unbounded body."""
-        ...
-
-    @property
-    def bounds_mm(self) -> Float64Array:
-        """Axis-parallel box, shape (2, 3): lowest and highest corner in LPS mm."""
-        ...
-
-    def describe(self) -> dict[str, Any]:
-        """Kind, parameters, area and volume as plain JSON types (null where infinite)."""
-        ...
 
 
 def _vector(name: str, value: ArrayLike) -> Float64Array:
@@ -70,7 +44,7 @@ def _positive(name: str, value: float) -> float:
     return number
 
 
-def _points(points_mm: ArrayLike) -> Float64Array:
+def checked_points(points_mm: ArrayLike) -> Float64Array:
     points = np.asarray(points_mm, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise UsageError(f"points have shape (n, 3), these have {points.shape}")
@@ -83,46 +57,71 @@ def _box_distance(excess: Float64Array) -> Float64Array:
     return -(outside + np.minimum(excess.max(axis=1), 0.0))
 
 
-def _listed(vector: Float64Array) -> list[float]:
-    return [float(value) for value in vector]
+def _split(offsets: Float64Array, axis: Float64Array) -> tuple[Float64Array, Float64Array]:
+    """Return the signed lengths of offsets (n, 3) along a unit vector, and their lengths across it."""
+    along = offsets @ axis
+    return along, np.linalg.norm(offsets - along[:, None] * axis, axis=1)
 
 
-class Sphere:
-    """Ball around a centre in LPS mm."""
+class Body(abc.ABC):
+    """A solid with an exact signed distance, area and volume."""
 
-    def __init__(self, center: ArrayLike, radius: float):
-        self.center = _vector("center", center)
-        self.radius = _positive("radius", radius)
+    kind: str
+    center: Float64Array
+    area_mm2: float
+    volume_ml: float
+    reach_mm: Float64Array | float
+    """Half of the axis-parallel box around the body."""
 
     def signed_distance(self, points_mm: ArrayLike) -> Float64Array:
-        """Distance in mm to the surface, positive inside, (n,) float64 for points (n, 3)."""
-        offset = _points(points_mm) - self.center
-        return self.radius - np.sqrt(np.einsum("ij,ij->i", offset, offset))
+        """Distance in mm to the surface, positive inside, (n,) float64 for points (n, 3) in LPS mm."""
+        return self._distance(checked_points(points_mm) - self.center)
 
-    @property
-    def area_mm2(self) -> float:
-        return 4.0 * math.pi * self.radius**2
-
-    @property
-    def volume_ml(self) -> float:
-        return 4.0 / 3.0 * math.pi * self.radius**3 / 1000.0
+    @abc.abstractmethod
+    def _distance(self, offsets: Float64Array) -> Float64Array:
+        """Return `signed_distance` of points given from the centre."""
 
     @property
     def bounds_mm(self) -> Float64Array:
-        return np.array((self.center - self.radius, self.center + self.radius))
+        """Axis-parallel box, shape (2, 3): lowest and highest corner in LPS mm."""
+        return np.array((self.center - self.reach_mm, self.center + self.reach_mm))
+
+    @abc.abstractmethod
+    def _parameters(self) -> dict[str, Any]: ...
 
     def describe(self) -> dict[str, Any]:
+        """Kind, parameters, area and volume as plain JSON types."""
         return {
-            "kind": "sphere",
-            "center_lps_mm": _listed(self.center),
-            "radius_mm": self.radius,
+            "kind": self.kind,
+            "center_lps_mm": self.center.tolist(),
+            **self._parameters(),
             "area_mm2": self.area_mm2,
             "volume_ml": self.volume_ml,
         }
 
 
-class Torus:
+class Sphere(Body):
+    """Ball around a centre in LPS mm."""
+
+    kind = "sphere"
+
+    def __init__(self, center: ArrayLike, radius: float):
+        self.center = _vector("center", center)
+        self.radius = self.reach_mm = _positive("radius", radius)
+        self.area_mm2 = 4.0 * math.pi * self.radius**2
+        self.volume_ml = 4.0 / 3.0 * math.pi * self.radius**3 / 1000.0
+
+    def _distance(self, offsets: Float64Array) -> Float64Array:
+        return self.radius - np.sqrt(np.einsum("ij,ij->i", offsets, offsets))
+
+    def _parameters(self) -> dict[str, Any]:
+        return {"radius_mm": self.radius}
+
+
+class Torus(Body):
     """Ring torus around an axis of any length; radius of the centre line, `major`, and of the tube, `minor`, in mm."""
+
+    kind = "torus"
 
     def __init__(self, center: ArrayLike, axis: ArrayLike, major: float, minor: float):
         self.center = _vector("center", center)
@@ -131,88 +130,49 @@ class Torus:
         self.minor = _positive("minor", minor)
         if self.minor >= self.major:
             raise UsageError(f"a torus needs minor < major, got minor {self.minor:g} and major {self.major:g} mm")
+        # Pappus
+        self.area_mm2 = 4.0 * math.pi**2 * self.major * self.minor
+        self.volume_ml = 2.0 * math.pi**2 * self.major * self.minor**2 / 1000.0
+        self.reach_mm = self.major * np.sqrt(np.maximum(1.0 - self.axis**2, 0.0)) + self.minor
 
-    def signed_distance(self, points_mm: ArrayLike) -> Float64Array:
-        """Distance in mm to the surface, positive inside, (n,) float64 for points (n, 3)."""
-        offset = _points(points_mm) - self.center
-        along = offset @ self.axis
-        radial = np.linalg.norm(offset - along[:, None] * self.axis, axis=1)
+    def _distance(self, offsets: Float64Array) -> Float64Array:
+        along, radial = _split(offsets, self.axis)
         return self.minor - np.hypot(radial - self.major, along)
 
-    @property
-    def area_mm2(self) -> float:
-        """Area in mm2 (Pappus)."""
-        return 4.0 * math.pi**2 * self.major * self.minor
-
-    @property
-    def volume_ml(self) -> float:
-        """Volume in ml (Pappus)."""
-        return 2.0 * math.pi**2 * self.major * self.minor**2 / 1000.0
-
-    @property
-    def bounds_mm(self) -> Float64Array:
-        reach = self.major * np.sqrt(np.maximum(1.0 - self.axis**2, 0.0)) + self.minor
-        return np.array((self.center - reach, self.center + reach))
-
-    def describe(self) -> dict[str, Any]:
-        return {
-            "kind": "torus",
-            "center_lps_mm": _listed(self.center),
-            "axis_lps": _listed(self.axis),
-            "major_radius_mm": self.major,
-            "minor_radius_mm": self.minor,
-            "area_mm2": self.area_mm2,
-            "volume_ml": self.volume_ml,
-        }
+    def _parameters(self) -> dict[str, Any]:
+        return {"axis_lps": self.axis.tolist(), "major_radius_mm": self.major, "minor_radius_mm": self.minor}
 
 
-class Cylinder:
+class Cylinder(Body):
     """Circular cylinder with flat caps; its centre is the middle of its axis, which may have any length."""
+
+    kind = "cylinder"
 
     def __init__(self, center: ArrayLike, axis: ArrayLike, radius: float, length: float):
         self.center = _vector("center", center)
         self.axis = _unit("axis", axis)
         self.radius = _positive("radius", radius)
         self.length = _positive("length", length)
+        self.area_mm2 = 2.0 * math.pi * self.radius * (self.length + self.radius)  # caps included
+        self.volume_ml = math.pi * self.radius**2 * self.length / 1000.0
+        across = np.sqrt(np.maximum(1.0 - self.axis**2, 0.0))
+        self.reach_mm = np.abs(self.axis) * self.length / 2.0 + self.radius * across
 
-    def signed_distance(self, points_mm: ArrayLike) -> Float64Array:
-        """Distance in mm to the surface, positive inside, (n,) float64 for points (n, 3)."""
-        offset = _points(points_mm) - self.center
-        along = offset @ self.axis
-        radial = np.linalg.norm(offset - along[:, None] * self.axis, axis=1)
+    def _distance(self, offsets: Float64Array) -> Float64Array:
+        along, radial = _split(offsets, self.axis)
         return _box_distance(np.stack((radial - self.radius, np.abs(along) - self.length / 2.0), axis=1))
 
-    @property
-    def area_mm2(self) -> float:
-        """Area in mm2, caps included."""
-        return 2.0 * math.pi * self.radius * (self.length + self.radius)
-
-    @property
-    def volume_ml(self) -> float:
-        return math.pi * self.radius**2 * self.length / 1000.0
-
-    @property
-    def bounds_mm(self) -> Float64Array:
-        reach = np.abs(self.axis) * self.length / 2.0 + self.radius * np.sqrt(np.maximum(1.0 - self.axis**2, 0.0))
-        return np.array((self.center - reach, self.center + reach))
-
-    def describe(self) -> dict[str, Any]:
-        return {
-            "kind": "cylinder",
-            "center_lps_mm": _listed(self.center),
-            "axis_lps": _listed(self.axis),
-            "radius_mm": self.radius,
-            "length_mm": self.length,
-            "area_mm2": self.area_mm2,
-            "volume_ml": self.volume_ml,
-        }
+    def _parameters(self) -> dict[str, Any]:
+        return {"axis_lps": self.axis.tolist(), "radius_mm": self.radius, "length_mm": self.length}
 
 
-class Box:
+class Box(Body):
     """Oblique box: a slab, `thickness` mm thick, with two large faces square to `normal`, of any length.
 
     The width is along `edge`, less its part along `normal`; default: some direction square to `normal`.
     """
+
+    kind = "plane"
 
     def __init__(
         self, center: ArrayLike, normal: ArrayLike, thickness: float, width: float, height: float,
@@ -232,38 +192,22 @@ class Box:
         )
         # rows: width, height and thickness directions
         self._axes = np.array((self.edge, np.cross(self.normal, self.edge), self.normal))
+        wide, high, thick = self.size.tolist()
+        self.area_mm2 = 2.0 * (wide * high + high * thick + thick * wide)
+        self.volume_ml = float(np.prod(self.size)) / 1000.0
+        self.reach_mm = (self.size / 2.0) @ np.abs(self._axes)
 
-    def signed_distance(self, points_mm: ArrayLike) -> Float64Array:
-        """Distance in mm to the surface, positive inside, (n,) float64 for points (n, 3)."""
-        local = (_points(points_mm) - self.center) @ self._axes.T
-        return _box_distance(np.abs(local) - self.size / 2.0)
+    def _distance(self, offsets: Float64Array) -> Float64Array:
+        return _box_distance(np.abs(offsets @ self._axes.T) - self.size / 2.0)
 
-    @property
-    def area_mm2(self) -> float:
-        width, height, thickness = self.size
-        return float(2.0 * (width * height + height * thickness + thickness * width))
-
-    @property
-    def volume_ml(self) -> float:
-        return float(np.prod(self.size)) / 1000.0
-
-    @property
-    def bounds_mm(self) -> Float64Array:
-        reach = (self.size / 2.0) @ np.abs(self._axes)
-        return np.array((self.center - reach, self.center + reach))
-
-    def describe(self) -> dict[str, Any]:
-        width, height, thickness = _listed(self.size)
+    def _parameters(self) -> dict[str, Any]:
+        width, height, thickness = self.size.tolist()
         return {
-            "kind": "plane",
-            "center_lps_mm": _listed(self.center),
-            "normal_lps": _listed(self.normal),
-            "edge_lps": _listed(self.edge),
+            "normal_lps": self.normal.tolist(),
+            "edge_lps": self.edge.tolist(),
             "thickness_mm": thickness,
             "width_mm": width,
             "height_mm": height,
-            "area_mm2": self.area_mm2,
-            "volume_ml": self.volume_ml,
         }
 
 
@@ -291,8 +235,7 @@ def choose_body(affine: NDArray[np.float64], settings: PhantomSettings) -> Body:
     if settings.kind == "sphere":
         radius = given if given is not None else 0.7 * reach
         body = Sphere(centre, radius)
-        extent = radius
-        thinnest = 2.0 * radius
+        extent, thinnest = radius, 2.0 * radius
     elif settings.kind == "torus":
         radius = given if given is not None else 0.6 * reach
         body = Torus(centre, _AXIS_LPS, radius, 0.4 * radius)

@@ -23,7 +23,7 @@ from clrecon.proof.phantom.build import LARGEST_TRUTH, TRUTH_NAME, is_phantom_tr
 from clrecon.proof.phantom.fields import Function, gradient_of
 from clrecon.proof.phantom.series import place_slices
 from clrecon.proof.phantom.settings import CENTRE_LPS_MM, KINDS, PhantomSettings
-from clrecon.proof.phantom.shapes import choose_body
+from clrecon.proof.phantom.shapes import checked_points, choose_body
 from clrecon.proof.phantom.spine import label_levels, plan_spine
 from clrecon.proof.phantom.spine_parts import Vertebra, level_number
 from clrecon.proof.phantom.vertebra import local_bounds, vertebra_distance, vertebra_shape
@@ -307,9 +307,7 @@ class PhantomTruth:
 
 
 def _checked(points_mm: ArrayLike) -> Float64Array:
-    points = np.asarray(points_mm, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise UsageError(f"points have shape (n, 3), these have {points.shape}")
+    points = checked_points(points_mm)
     if not np.isfinite(points).all():
         raise UsageError(f"{int((~np.isfinite(points)).any(axis=1).sum())} of {len(points)} points are not finite")
     return points
