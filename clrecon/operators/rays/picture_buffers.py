@@ -46,6 +46,12 @@ def light_row(light: Lighting) -> tuple[float, float, float, float]:
     return (0.0, 0.0, 0.0, 0.0) if light.direction is None else (*light.direction, 1.0)
 
 
+def background_color(background: str | Sequence[float] | None) -> NDArray[np.float32]:
+    """Return red, green, blue and opacity for a kernel; nothing without a background."""
+    color = (0.0, 0.0, 0.0, 0.0) if background is None else (*find_color(background), 1.0)
+    return np.array(color, np.float32)
+
+
 def describe_picture(
     mode: str, device: Device, stopwatch: Stopwatch, warnings: Sequence[str], **facts: Any
 ) -> dict[str, Any]:
@@ -234,9 +240,7 @@ class PictureBuffers:
         self.depths, self.depths_d = empty_output(device, (height, width), np.float32)
         self.means, self.means_d = empty_output(device, (height, width), np.float32)
         self.states_d: Any = allocate(device, 32 * width * height if several_slabs else 32)
-        self.background = np.zeros(4, np.float32)
-        if background is not None:
-            self.background[:] = *find_color(background), 1.0
+        self.background = background_color(background)
 
     @classmethod
     def of_states(cls, device: Device, size: tuple[int, int], states_d: Any) -> PictureBuffers:

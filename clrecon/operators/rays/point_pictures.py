@@ -14,7 +14,7 @@ from clrecon.errors import DeviceMemoryError, UsageError
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.grid import Grid
 from clrecon.opencl import Device, Stopwatch
-from clrecon.operators.rays.picture_buffers import Shot, describe_picture, highlight_table, light_row
+from clrecon.operators.rays.picture_buffers import Shot, background_color, describe_picture, highlight_table, light_row
 from clrecon.operators.resident.device_volume import DeviceWorker
 from clrecon.points import PointCloud
 from clrecon.points.spacing import mean_spacing
@@ -101,9 +101,7 @@ class _Splats:
         self.shading = shading if discs.lighting.shades else "none"
         base = np.zeros(3) if discs.base is None else discs.base
         self.table = eye_table(camera, self.size, discs.lighting, base)
-        self.background = np.zeros(4, np.float32)
-        if background is not None:
-            self.background[:] = *find_color(background), 1.0
+        self.background = background_color(background)
         self.disc_pixels = min(max(discs.radius_mm / camera.pixel_mm(self.size), SMALLEST_DISC), LARGEST_DISC)
 
     def plan(self, memory: int | None) -> int:

@@ -130,6 +130,13 @@ class Plan:
     rest: tuple[float, float] = (0.0, 0.0)
 
 
+def plan_subslices(affine: Float64Array) -> tuple[Float64Array, float]:
+    """Return the places, in slices, of thin slices that are averaged to one, and mm of an interface's ramp: a voxel."""
+    di, dj, dk = column_spacing(affine)
+    count = int(np.clip(round(dk / math.sqrt(di * dj)), 1, 4))
+    return (np.arange(count) + 0.5) / count - 0.5, (di * dj * dk / count) ** (1.0 / 3.0)
+
+
 def draw_scene(
     parts: Sequence[Part], settings: PhantomSettings, affine: Float64Array, progress: Progress | None = None
 ) -> tuple[Float32Array, LabelArray]:
@@ -141,13 +148,10 @@ def draw_scene(
     shape = settings.shape_kji
     grid = affine.copy()
     grid[:3, 3] -= CENTRE_LPS_MM
-    di, dj, dk = column_spacing(affine)
-    subslices = int(np.clip(round(dk / math.sqrt(di * dj)), 1, 4))
-    ramp = (di * dj * dk / subslices) ** (1.0 / 3.0)
+    offsets, ramp = plan_subslices(affine)
     margin = np.full(3, 2.0 * ramp + float(np.linalg.norm(grid[:3, :3], axis=0).max()))
     placed = [PlacedPiece(np.array(p.center), p.axes, p.low - margin, p.high + margin, grid, shape) for p in parts]
     voxels, labels = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.uint8)
-    offsets = (np.arange(subslices) + 0.5) / subslices - 0.5
     for k in range(shape[0]):
         met = [(part, piece) for part, piece in zip(parts, placed, strict=True) if piece.meets(k)]
         for offset in offsets:
@@ -156,7 +160,7 @@ def draw_scene(
                 window = piece.window(k + offset)
                 paint(canvas, window.region, coverage(_distance(part, window), ramp), part.hu)
             voxels[k] += canvas
-        voxels[k] /= np.float32(subslices)
+        voxels[k] /= np.float32(len(offsets))
         for part, piece in met:
             window = piece.window(float(k))
             labels[k][window.region][_distance(part, window) >= 0.0] = MATERIALS.index(part.material)

@@ -214,6 +214,9 @@ class Box(Body):
 _AXIS_LPS = (0.36, -0.48, 0.8)
 """Axis of torus, cylinder and slab: unit length, parallel to no axis of the patient or of usual slices."""
 
+_RADIUS_SHARES = {"sphere": 0.7, "torus": 0.6, "cylinder": 0.4, "plane": 0.2}
+"""Radius, without one in the settings, as a share of the room about the centre; half of the plane's thickness."""
+
 _MARGIN_STEPS = 1.5
 """Steps of background kept between the body and the faces of the volume."""
 
@@ -230,26 +233,22 @@ def choose_body(affine: NDArray[np.float64], settings: PhantomSettings) -> Body:
         raise UsageError(
             f"a {settings.kind} needs at least 4 voxels along every axis, this volume has {settings.shape_kji[::-1]}"
         )
-    given = settings.radius_mm
+    if settings.kind not in _RADIUS_SHARES:
+        raise UsageError(f"a {settings.kind} phantom has no analytic body")
+    radius = _RADIUS_SHARES[settings.kind] * reach if settings.radius_mm is None else settings.radius_mm
     body: Body
     if settings.kind == "sphere":
-        radius = given if given is not None else 0.7 * reach
         body = Sphere(centre, radius)
         extent, thinnest = radius, 2.0 * radius
     elif settings.kind == "torus":
-        radius = given if given is not None else 0.6 * reach
         body = Torus(centre, _AXIS_LPS, radius, 0.4 * radius)
         extent, thinnest = 1.4 * radius, 0.8 * radius
     elif settings.kind == "cylinder":
-        radius = given if given is not None else 0.4 * reach
         body = Cylinder(centre, _AXIS_LPS, radius, 3.0 * radius)
         extent, thinnest = float(np.hypot(1.0, 1.5)) * radius, 2.0 * radius
-    elif settings.kind == "plane":
-        radius = given if given is not None else 0.2 * reach
+    else:
         body = Box(centre, _AXIS_LPS, 2.0 * radius, 0.9 * reach, 0.7 * reach)
         extent, thinnest = float(np.linalg.norm(body.size)) / 2.0, 2.0 * radius
-    else:
-        raise UsageError(f"a {settings.kind} phantom has no analytic body")
     largest_step = float(np.linalg.norm(affine[:3, :3], axis=0).max())
     if thinnest < 2.0 * largest_step:
         raise UsageError(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 
 from clrecon.geometry import column_spacing
 from clrecon.proof.phantom.fields import Field, capsule, coverage, ellipse, ellipsoid, waves_at
-from clrecon.proof.phantom.scenes import Part, PlacedPiece, Plan, Window, lay_under, paint
+from clrecon.proof.phantom.scenes import Part, PlacedPiece, Plan, Window, lay_under, paint, plan_subslices
 from clrecon.proof.phantom.settings import CENTRE_LPS_MM, PhantomSettings
 from clrecon.proof.phantom.spine_parts import Anatomy, Vertebra, level_number
 from clrecon.proof.phantom.spine_plan import plan_anatomy
@@ -338,16 +337,13 @@ def draw_spine(
 ) -> tuple[Float32Array, Anatomy]:
     """Draw the spine in HU at `places` k; return its plan about `CENTRE_LPS_MM` too; `blood_hu` are of vessels."""
     shape = settings.shape_kji
-    di, dj, dk = column_spacing(affine)
-    subslices = int(np.clip(round(dk / math.sqrt(di * dj)), 1, 4))
-    ramp = (di * dj * dk / subslices) ** (1.0 / 3.0)
+    offsets, ramp = plan_subslices(affine)
     anatomy, grid = plan_spine(settings, affine)
     scene = _Scene(anatomy, grid, shape, ramp)
     body = Plan([], front=-anatomy.half_depth, back=anatomy.half_depth)
     is_own = settings.table_used == "own"
     table = None if is_own else lay_under(body, settings.table_used, settings.table_gap_mm, settings.prone)
     voxels = np.empty(shape, dtype=np.float32)
-    offsets = (np.arange(subslices) + 0.5) / subslices - 0.5
 
     def draw_slice(k: int, slice_place: float) -> None:
         full = Window((slice(0, shape[1]), slice(0, shape[2])), grid, slice_place)
@@ -357,11 +353,11 @@ def draw_spine(
         scratch = np.full(shape[1:], -1e3, dtype=np.float32)
         voxels[k] = 0.0
         for offset in offsets:
-            canvas = tissue.copy() if subslices > 1 else tissue
+            canvas = tissue.copy() if len(offsets) > 1 else tissue
             scene.draw(canvas, scratch, k, slice_place + offset)
             voxels[k] += canvas
-        if subslices > 1:
-            voxels[k] /= np.float32(subslices)
+        if len(offsets) > 1:
+            voxels[k] /= np.float32(len(offsets))
 
     # One thread: the pieces are small, and threads lose more time to the interpreter lock than they gain.
     for k in range(shape[0]):

@@ -248,13 +248,14 @@ _DIM = TransferFunction([(20, 0.9, 0.2, 0.1, 0.0), (90, 1, 0.7, 0.4, 0.2), (130,
 """A transfer function for voxels of 8 bits."""
 
 
-def _compare_picture(picture: Rendering, image: NDArray[Any], depth: NDArray[Any], subject: str) -> float:
-    """Compare colours over black and depths, pixel by pixel."""
+def _compare_picture(picture: Rendering, rgba: NDArray[Any], depth: NDArray[Any], subject: str) -> float:
+    """Compare colours over black, 0 to 1, and depths, pixel by pixel."""
     require_whole(picture.report)
     both = np.isfinite(picture.depth) & np.isfinite(depth)
     require_share(np.isfinite(picture.depth), np.isfinite(depth), 0.0, EDGE_SHARE, f"hits of {subject}")
     require_share(picture.depth[both], depth[both], DEPTH_MM, 2.0 * EDGE_SHARE, f"depths of {subject}, in mm")
-    return require_colors(picture.image, image, COLOR_255, f"colours of {subject}", EDGE_SHARE)
+    colors = 255.0 * np.clip(rgba, 0.0, 1.0)
+    return require_colors(picture.image, colors, COLOR_255, f"colours of {subject}", EDGE_SHARE)
 
 
 def _cut_middle(volume: Volume) -> Clip:
@@ -276,10 +277,8 @@ def _check_composite(device: Device, scenes: tuple[tuple[str, TransferFunction, 
         )  # fmt: skip
         picture = take_picture(DeviceVolume(volume, device=device), style, Shot(camera, SIZE), step)
         twin = cast_rays(volume, style, camera, SIZE)
-        image = 255.0 * np.clip(twin.rgba, 0.0, 1.0)
-        worst = max(
-            worst, _compare_picture(picture, image, twin.depth, f"{dtype} voxels{' of uneven slices' * uneven}")
-        )
+        subject = f"{dtype} voxels{' of uneven slices' * uneven}"
+        worst = max(worst, _compare_picture(picture, twin.rgba, twin.depth, subject))
     return f"{len(scenes)} pictures of {SIZE[0]} x {SIZE[1]} pixels within {worst:.1f} of 255"
 
 
@@ -354,10 +353,8 @@ def _check_surfaces(device: Device, uneven: bool, ambient_occlusion: float = 0.0
         )
         picture = cast_surface(DeviceVolume(volume, device=device), style, Shot(camera, SIZE), step)
         twin = surface_twin(volume, style, camera, SIZE)
-        image = 255.0 * np.clip(twin.rgba, 0.0, 1.0)
-        worst = max(
-            worst, _compare_picture(picture, image, twin.depth, f"{dtype} voxels{' of uneven slices' * uneven}")
-        )
+        subject = f"{dtype} voxels{' of uneven slices' * uneven}"
+        worst = max(worst, _compare_picture(picture, twin.rgba, twin.depth, subject))
     return f"3 pictures of {SIZE[0]} x {SIZE[1]} pixels within {worst:.1f} of 255"
 
 
@@ -389,7 +386,7 @@ def _check_slices(device: Device) -> str:
         style = SlicesInSpace([1, 4, 7, 12], opacity=0.4, lowest_hu=-300.0, window=(-500.0, 700.0), clip=clip)
         picture = overlay_slices(DeviceVolume(volume, device=device), style, Shot(camera, SIZE))
         rgba, depth = overlay_twin(volume, camera, SIZE, style)
-        worst = max(worst, _compare_picture(picture, 255.0 * rgba, depth, f"slices of {dtype} voxels"))
+        worst = max(worst, _compare_picture(picture, rgba, depth, f"slices of {dtype} voxels"))
     return f"3 pictures of {SIZE[0]} x {SIZE[1]} pixels within {worst:.1f} of 255"
 
 
