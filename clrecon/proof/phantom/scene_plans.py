@@ -13,7 +13,20 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from clrecon.proof.phantom.fields import Field, coverage, ellipsoid
-from clrecon.proof.phantom.scenes import AIR_HU, METAL_HU, Part, Plan, Point, ball, box, column, cut, lay_under, rod
+from clrecon.proof.phantom.scenes import (
+    AIR_HU,
+    METAL_HU,
+    Part,
+    Plan,
+    Point,
+    ball,
+    box,
+    column,
+    cut,
+    lay_under,
+    rod,
+    to_point,
+)
 from clrecon.proof.phantom.settings import PhantomSettings
 from clrecon.proof.phantom.spine_parts import Vertebra
 from clrecon.proof.phantom.spine_plan import plan_anatomy
@@ -78,22 +91,14 @@ def _face(inside_material: str, inside_hu: float) -> list[Part]:
     parts: list[Part] = []
     for side in (1.0, -1.0):
         orbit = (side * 32.0, -66.0, level + 12.0)
+        cheek = (side * 62.0, -38.0, level - 8.0)
         parts += [
             ball("bone", _SKULL_COMPACT_HU, orbit, (21.0, 24.0, 20.0)),
             ball(inside_material, inside_hu, (orbit[0], orbit[1] - 4.0, orbit[2]), (19.0, 24.0, 18.0)),
             ball("bone", _SKULL_COMPACT_HU, (side * 24.0, -60.0, level - 22.0), (19.0, 20.0, 20.0)),
             ball("air", AIR_HU, (side * 24.0, -60.0, level - 22.0), (17.2, 18.2, 18.2)),
-            rod(
-                "bone",
-                _SKULL_COMPACT_HU,
-                (side * 44.0, -70.0, level - 10.0),
-                (side * 62.0, -38.0, level - 8.0),
-                4.5,
-                2.5,
-            ),
-            rod(
-                "bone", _SKULL_COMPACT_HU, (side * 62.0, -38.0, level - 8.0), (side * 60.0, -2.0, level - 2.0), 2.5, 3.0
-            ),
+            rod("bone", _SKULL_COMPACT_HU, (side * 44.0, -70.0, level - 10.0), cheek, 4.5, 2.5),
+            rod("bone", _SKULL_COMPACT_HU, cheek, (side * 60.0, -2.0, level - 2.0), 2.5, 3.0),
         ]
         corner = (side * 46.0, -14.0, level - 60.0)
         parts += [
@@ -169,7 +174,7 @@ def plan_pair() -> Plan:
 def _vertebra(vertebra: Vertebra, center: np.ndarray, axes: np.ndarray, marrow_hu: float) -> list[Part]:
     """Plan cortex and marrow of a vertebra at any place and angle."""
     low, high = local_bounds(vertebra)
-    spot = (float(center[0]), float(center[1]), float(center[2]))
+    spot = to_point(center)
 
     def bone(x: Field, y: Field, z: Field) -> Field:
         return vertebra_distance(vertebra, x, y, z)
@@ -264,11 +269,11 @@ def plan_contrast() -> Plan:
         half, ends = (disc.half_width, disc.half_depth), (-disc.half_length, disc.half_length)
         core = column("tissue", 92.0, (0.0, 0.0), half, ends)
         # painted before the vertebrae, which cover them
-        parts.insert(7, dataclasses.replace(core, center=_point(disc.center), axes=disc.axes))
+        parts.insert(7, dataclasses.replace(core, center=to_point(disc.center), axes=disc.axes))
     for rib in anatomy.ribs:
-        chain = [_point(point) for point in rib.points]
+        chain = [to_point(point) for point in rib.points]
         parts += [rod("bone", 800.0, start, end, 4.0) for start, end in zip(chain[:-1:2], chain[2::2], strict=False)]
-    spine = [_point(v.center) for v in anatomy.vertebrae]
+    spine = [to_point(v.center) for v in anatomy.vertebrae]
     aorta = [(x + 16.0, y - 40.0, z) for x, y, z in spine]
     parts += [rod("contrast", 400.0, a, b, 13.0) for a, b in zip(aorta[:-1], aorta[1:], strict=True)]
     cava = [(x - 18.0, y - 38.0, z) for x, y, z in spine]
@@ -280,10 +285,6 @@ def plan_contrast() -> Plan:
         *(ball("contrast", 300.0, (s * 58.0, spine[13][1] + 6.0, spine[13][2]), (24.0, 20.0, 48.0)) for s in (1, -1)),
     ]
     return Plan(parts, front=-depth, back=depth)
-
-
-def _point(vector: np.ndarray) -> tuple[float, float, float]:
-    return float(vector[0]), float(vector[1]), float(vector[2])
 
 
 def plan_water() -> Plan:
@@ -328,7 +329,8 @@ def plan_jaw() -> Plan:
         ball("air", AIR_HU, (0.0, 2.0, 10.0), (13.0, 15.0, 7.0)),
         *_tubes(body, 2.2, 1400.0, 60.0),
     ]
-    *teeth, lost = (-66.0, -50.0, -36.0, -22.0, -8.0, 8.0, 22.0, 52.0, 68.0, 37.0)
+    teeth = (-66.0, -50.0, -36.0, -22.0, -8.0, 8.0, 22.0, 52.0, 68.0)
+    lost = 37.0
     parts += [rod("bone", 1900.0, _arch(angle, 0.0), _arch(angle, 13.0), 3.0) for angle in teeth]
     parts += [rod("metal", METAL_HU, _arch(lost, -4.0), _arch(lost, 12.0), 2.0)]
     return Plan(parts, front=-36.0, back=48.0)
@@ -349,8 +351,7 @@ def plan_long_bone() -> Plan:
     jitter = np.random.default_rng(20)
     for axis, first, second in itertools.product(range(3), np.arange(-0.9, 1.0, 0.6), np.arange(-0.9, 1.0, 0.6)):
         ends = np.insert(np.add((first, second), jitter.uniform(-0.05, 0.05, (2, 2))), axis, (-1.5, 1.5), axis=1)
-        a, b = ((float(end[0]), float(end[1]), float(end[2])) for end in ends)
-        parts.append(cut(rod("bone", 2600.0, a, b, 0.08), within))
+        parts.append(cut(rod("bone", 2600.0, to_point(ends[0]), to_point(ends[1]), 0.08), within))
     return Plan(parts, front=-1.96, back=1.96)
 
 
@@ -370,9 +371,9 @@ def plan_hand() -> Plan:
         joint = np.array(base)
         for length, radius in list(zip(lengths, radii, strict=True))[first:]:
             start, joint = joint + radius * direction, joint + scale * length * direction
-            bones.append(([_point(start), _point(joint - radius * direction)], radius))
+            bones.append(([to_point(start), to_point(joint - radius * direction)], radius))
             joint = joint + 2.8 * direction
-        flesh.append(rod("tissue", 60.0, base, _point(joint), 10.0, 8.0))
+        flesh.append(rod("tissue", 60.0, base, to_point(joint), 10.0, 8.0))
     places = [(x, y, z) for (z, y), x in itertools.product(((-51.0, 0.0), (-63.5, 1.0)), (-22.0, -8.0, 6.0, 20.0))]
     wrist = [([(x - 0.7, y, z), (x + 0.7, y, z)], 5.0) for x, y, z in places]
     palm = ball("tissue", 60.0, (-4.0, 0.0, -30.0), (40.0, 13.0, 34.0))

@@ -19,7 +19,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from clrecon.geometry import column_spacing
 from clrecon.proof.phantom.fields import Field, capsule, coverage, ellipse, ellipsoid
@@ -203,6 +203,11 @@ def bone_depth(parts: Sequence[Part], points_mm: Float64Array, *materials: str) 
 Distance = Callable[[Field, Field, Field], Field]
 
 
+def to_point(vector: ArrayLike) -> Point:
+    x, y, z = map(float, np.asarray(vector))
+    return x, y, z
+
+
 def ball(material: str, hu: float, center: Point, half: Point) -> Part:
     low = (-half[0], -half[1], -half[2])
     return Part(material, hu, lambda x, y, z: ellipsoid(x, y, z, half), low, half, center)
@@ -212,13 +217,7 @@ def rod(material: str, hu: float, a: Point, b: Point, radius_a: float, radius_b:
     end = radius_a if radius_b is None else radius_b
     wide = max(radius_a, end)
     low, high = np.minimum(a, b) - wide, np.maximum(a, b) + wide
-    return Part(
-        material,
-        hu,
-        lambda x, y, z: capsule((x, y, z), a, b, radius_a, end),
-        (float(low[0]), float(low[1]), float(low[2])),
-        (float(high[0]), float(high[1]), float(high[2])),
-    )
+    return Part(material, hu, lambda x, y, z: capsule((x, y, z), a, b, radius_a, end), to_point(low), to_point(high))
 
 
 def column(
@@ -238,17 +237,14 @@ def column(
 
 
 def box(material: str, hu: float, low: Point, high: Point) -> Part:
-    half = tuple((b - a) / 2.0 for a, b in zip(low, high, strict=True))
-    middle = tuple((b + a) / 2.0 for a, b in zip(low, high, strict=True))
+    half = np.subtract(high, low) / 2.0
+    middle = np.add(high, low) / 2.0
 
     def distance(x: Field, y: Field, z: Field) -> Field:
         sides = (np.float32(length) - np.abs(at) for length, at in zip(half, (x, y, z), strict=True))
         return np.minimum.reduce(list(sides))
 
-    return Part(
-        material, hu, distance, (-half[0], -half[1], -half[2]), (half[0], half[1], half[2]),
-        (middle[0], middle[1], middle[2]),
-    )  # fmt: skip
+    return Part(material, hu, distance, to_point(-half), to_point(half), to_point(middle))
 
 
 def cut(part: Part, keep: Distance) -> Part:
