@@ -192,8 +192,7 @@ _KINDS: dict[str, tuple[str, Accepts]] = {
     "Mapping": ("a mapping", lambda value: isinstance(value, Mapping)),
     **dict.fromkeys(_CHOICES, ("a text", lambda value: isinstance(value, str))),
     "Grid": ("a Volume", functools.partial(_is_of_class, "Grid")),
-    # of `Mask`, whose parts stand in classes of their own
-    **dict.fromkeys(("Shapes", "Bits"), ("a Mask", functools.partial(_is_of_class, "Mask"))),
+    "Bits": ("a Mask", functools.partial(_is_of_class, "Mask")),  # of `Mask` and what it is built on
     **{name: (f"a {name}", functools.partial(_is_of_class, name)) for name in _CLASSES},
 }
 

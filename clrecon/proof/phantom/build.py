@@ -46,12 +46,12 @@ def facts_of_spine(anatomy: Anatomy, affine: Float64Array, settings: PhantomSett
         "vertebrae": [
             {
                 "name": vertebra.name,
-                "center_lps_mm": [float(value) for value in vertebra.center + centre],
+                "center_lps_mm": (vertebra.center + centre).tolist(),
                 "inside": inside(vertebra.center + centre),
             }
             for vertebra in anatomy.vertebrae
         ],
-        "left_marker_lps_mm": [float(value) for value in anatomy.marker + centre],
+        "left_marker_lps_mm": (anatomy.marker + centre).tolist(),
         "left_marker_radius_mm": anatomy.marker_radius,
         "left_marker_inside": inside(anatomy.marker + centre),
         "absent": anatomy.absent,

@@ -229,15 +229,9 @@ _MOST_BEND = 60.0
 """Largest kyphosis and scoliosis that is added, degrees."""
 
 _CHOOSING = ("levels", "facet_gap_mm", "kyphosis_deg", "scoliosis_deg")
-_SPINE_ONLY: dict[str, Any] = {
-    "levels": None,
-    "facet_gap_mm": None,
-    "kyphosis_deg": 0.0,
-    "scoliosis_deg": 0.0,
-    "uneven_mm": 0.0,
-    "phases": 1,
-}
-"""Settings of a spine alone, with their defaults."""
+_SPINE_ONLY = (*_CHOOSING, "uneven_mm", "phases", "ghosts")
+_LATER = ("table", "table_gap_mm", "prone", *_SPINE_ONLY, "missing")
+"""Settings that older phantoms did not have."""
 _SAID = {"uneven_mm": "uneven slices", "facet_gap_mm": "facet joints"}
 _SAID_PLURAL = dict.fromkeys(("levels", "phases", "ghosts", "uneven_mm", "facet_gap_mm"), "they are")
 
@@ -414,8 +408,8 @@ class PhantomSettings:
         if self.levels is not None:
             object.__setattr__(self, "levels", format_levels(parse_levels(self.levels)))
         if self.kind != "spine":
-            for name, default in (*_SPINE_ONLY.items(), ("ghosts", False)):
-                if getattr(self, name) != default:
+            for name in _SPINE_ONLY:
+                if not self._is_default(name):
                     noun = _SAID.get(name) or name.removesuffix("_deg").removesuffix("_mm").replace("_", " ")
                     raise UsageError(f"a {self.kind} has no {noun}: {_SAID_PLURAL.get(name, 'it is')} for the spine")
         if self.slices is None or self.levels is not None:
@@ -440,6 +434,9 @@ class PhantomSettings:
                 raise UsageError("ghosts are for an even series of one phase without missing slices")
             ghost_places(self.slices)
 
+    def _is_default(self, name: str) -> bool:
+        return bool(getattr(self, name) == getattr(PhantomSettings, name))
+
     @property
     def _directions(self) -> tuple[float, tuple[float, float, float], bool]:
         return self.tilt, self.oblique, self.prone
@@ -447,7 +444,7 @@ class PhantomSettings:
     @property
     def spine_choice(self) -> SpineChoice | None:
         """What is chosen of a spine; None without levels, bend and facets."""
-        if self.kind != "spine" or all(getattr(self, name) == _SPINE_ONLY[name] for name in _CHOOSING):
+        if self.kind != "spine" or all(map(self._is_default, _CHOOSING)):
             return None
         return spine_choice(
             parse_levels(self.levels) if self.levels is not None else THORACOLUMBAR,
@@ -482,11 +479,8 @@ class PhantomSettings:
         plain = {
             name: list(value) if isinstance(value, tuple) else value for name, value in dataclasses.asdict(self).items()
         }
-        plain["missing"] = list(self.missing)
-        lying = {"table": None, "table_gap_mm": 0.0, "prone": False, "ghosts": False}
-        for name, default in {**lying, **_SPINE_ONLY, "missing": []}.items():
-            if plain[name] == default:
-                del plain[name]
+        for name in filter(self._is_default, _LATER):
+            del plain[name]
         return plain
 
 
