@@ -11,8 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import DeviceError
 from clrecon.geometry import Volume
+from clrecon.geometry.grid import DEVICE_DTYPES
 from clrecon.opencl import Device
 from clrecon.rendering.views.camera import Camera
+
+VOXEL_TYPES = tuple(dtype.name for dtype in DEVICE_DTYPES)
 
 LEAST_ITEMS = 501
 """Fewest work-items of a kernel in its check, where its data allow more: several work-groups on every device."""

@@ -22,12 +22,19 @@ from clrecon.operators.points.thinning import choose_points, grow_cells
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.points import PointCloud
 from clrecon.points.spacing import VARIATION_OF_FEATURES, distance_ratios, find_features, ratio_threshold
-from clrecon.proof.checking import OBLIQUE, Check, random_integers, require_close, require_equal, require_share, stack
-from clrecon.proof.points import clusters as clusters_twin
-from clrecon.proof.points import clusters as gradients_twin
-from clrecon.proof.points import clusters as grid_twin
-from clrecon.proof.points import field as twin
-from clrecon.proof.points import neighbours as filter_twin
+from clrecon.proof.checking import (
+    OBLIQUE,
+    VOXEL_TYPES,
+    Check,
+    random_integers,
+    require_close,
+    require_equal,
+    require_share,
+    stack,
+)
+from clrecon.proof.points import clusters as cluster_twin
+from clrecon.proof.points import field as field_twin
+from clrecon.proof.points import neighbours as neighbour_twin
 
 
 def scattered_points(n: int) -> NDArray[np.float32]:
@@ -40,15 +47,15 @@ def scattered_points(n: int) -> NDArray[np.float32]:
 def _check_grid(device: Device) -> str:
     points = scattered_points(20_000)
     for edge in (0.5, 2.3):
-        device_grid, twin = make_grid(device, points, edge), grid_twin.make_grid(points, edge)
+        device_grid, grid = make_grid(device, points, edge), cluster_twin.make_grid(points, edge)
         subject = f"of a grid of {edge} mm"
-        require_equal(device_grid.cells, len(twin.starts) - 1, f"the number of cells {subject}")
+        require_equal(device_grid.cells, len(grid.starts) - 1, f"the number of cells {subject}")
         for name, buffer, expected in (
-            ("mask", device_grid.mask_d, twin.mask),
-            ("ranks", device_grid.ranks_d, twin.ranks),
-            ("starts", device_grid.starts_d, twin.starts),
-            ("order", device_grid.order_d, twin.order),
-            *zip("xyz", (device_grid.x_d, device_grid.y_d, device_grid.z_d), twin.points.T, strict=True),
+            ("mask", device_grid.mask_d, grid.mask),
+            ("ranks", device_grid.ranks_d, grid.ranks),
+            ("starts", device_grid.starts_d, grid.starts),
+            ("order", device_grid.order_d, grid.order),
+            *zip("xyz", (device_grid.x_d, device_grid.y_d, device_grid.z_d), grid.points.T, strict=True),
         ):
             content = download(device, np.empty(expected.shape, expected.dtype), buffer)
             require_equal(content, expected, f"{name} {subject}")
@@ -65,7 +72,7 @@ def _check_neighbours(device: Device) -> str:
     many = scattered_points(30_000)  # in some 15,000 cells, of which a work-item takes 16
     for points, k in ((scattered, 16), (scattered, 5), (lattice, 16), (many, 2)):
         neighbours = find_neighbours(points, k, device=device)
-        indices, distances = filter_twin.find_neighbours(points, k)
+        indices, distances = neighbour_twin.find_neighbours(points, k)
         require_equal(neighbours.indices, indices, f"{k} nearest of {len(points):,} points")
         require_equal(neighbours.distances, distances, f"distances of the {k} nearest of {len(points):,} points")
     return "2 to 16 neighbours of up to 30,000 points equal"
@@ -87,7 +94,7 @@ def _check_clusters(device: Device) -> str:
     points = scattered_points(20_000)
     for samples in (1, 3):
         clusters = cluster_free_points(points, EPS, samples, device=device)
-        count, labels, cores = clusters_twin.cluster_points(points, EPS, samples)
+        count, labels, cores = cluster_twin.cluster_points(points, EPS, samples)
         subject = f"with {samples} samples"
         require_equal(clusters.count, count, f"the number of clusters {subject}")
         require_equal(clusters.cores, cores, f"core points {subject}")
@@ -100,18 +107,18 @@ def _check_passes(device: Device) -> str:
     points = scattered_points(20_000)
     samples, per_chunk = 3, 32
     plan = plan_cells(points, EPS)
-    device_grid, grid = fill_grid(device, plan), grid_twin.make_grid(points, float(plan.edge))
+    device_grid, grid = fill_grid(device, plan), cluster_twin.make_grid(points, float(plan.edge))
     search = ClusterSearch(device, device_grid, EPS, samples, per_chunk)
-    pairs = clusters_twin.count_pairs(grid, float(plan.edge), samples)
+    pairs = cluster_twin.count_pairs(grid, float(plan.edge), samples)
     require_close(search.count_pairs(), pairs, 1e-3, "pairs of points")
     search.find_cores()
     search.join_within()
-    _, labels, cores = clusters_twin.cluster_points(points, EPS, samples)
-    expected = clusters_twin.join_chunks(grid, cores[grid.order], EPS * (1.0 + 1e-6), per_chunk)
+    _, labels, cores = cluster_twin.cluster_points(points, EPS, samples)
+    expected = cluster_twin.join_chunks(grid, cores[grid.order], EPS * (1.0 + 1e-6), per_chunk)
     downloaded = download(device, np.empty(device_grid.cells, np.uint32), search.labels_d)
     require_equal(downloaded, expected, "labels within chunks")
     search.note_words()
-    roots = clusters_twin.note_words(grid, expected)
+    roots = cluster_twin.note_words(grid, expected)
     require_equal(download(device, np.empty(roots.shape, np.uint32), search.roots_d), roots, "roots of words")
     search.hook_chunks()
     require_equal(search.label()[0], labels, "labels of clusters that were found in small chunks")
@@ -121,7 +128,7 @@ def _check_passes(device: Device) -> str:
 def _check_thin(device: Device) -> str:
     points = scattered_points(20_000)
     chosen = choose_points(device, plan_grid(points, 2.1))
-    require_equal(chosen, grid_twin.choose_points(points, 2.1), "points nearest to the means of cells")
+    require_equal(chosen, cluster_twin.choose_points(points, 2.1), "points nearest to the means of cells")
     return f"{len(chosen):,} points of 20,000 equal"
 
 
@@ -129,7 +136,7 @@ def _check_sparse_cells(device: Device) -> str:
     points = scattered_points(20_000)
     for edge, fewest, threshold, largest in ((1.1, 2, 3, False), (1.6, 2, 4, True)):
         removed = grow_cells(device, plan_grid(points, edge), fewest, threshold, largest).removed
-        expected = grid_twin.grow_cells(points, edge, fewest, threshold, largest)
+        expected = cluster_twin.grow_cells(points, edge, fewest, threshold, largest)
         require_equal(removed, expected, f"what becomes of points in cells of {edge} mm")
     return "growth over 2 grids equal"
 
@@ -140,18 +147,13 @@ CLUSTER_CHECKS = (
     Check(
         "clusters of free points",
         (
-            "find_core_points",
-            "join_chunks",
-            "hook_cells",
-            "find_firsts",
-            "mark_firsts",
-            "number_cells",
+            "find_core_points", "join_chunks", "hook_cells", "find_firsts", "mark_firsts", "number_cells",
             "label_free_points",
         ),
         _check_clusters,
     ),
     Check("links of free points", ("join_chunks", "note_words", "hook_cells", "count_pairs"), _check_passes),
-)
+)  # fmt: skip
 
 
 K = 12
@@ -178,11 +180,11 @@ def _bumpy_sheet(n: int) -> NDArray[np.float32]:
 
 def _check_normals(device: Device) -> str:
     points = _bumpy_sheet(9_000)
-    indices, _ = filter_twin.find_neighbours(points, K)
-    axes, eigenvalues = filter_twin.principal_axes(points, indices)
+    indices, _ = neighbour_twin.find_neighbours(points, K)
+    axes, eigenvalues = neighbour_twin.principal_axes(points, indices)
     clear = (eigenvalues[:, 1] - eigenvalues[:, 0]) / eigenvalues[:, 2] > 0.03
     viewpoint = np.array([30.0, 30.0, -90.0])
-    expected = filter_twin.orient_from(axes, points, viewpoint)
+    expected = neighbour_twin.orient_from(axes, points, viewpoint)
     normals = estimate_normals(PointCloud(points), K, viewpoint=viewpoint, device=device).cloud.normals
     assert normals is not None
     return f"9,000 normals within {require_close(normals[clear], expected[clear], NORMAL, 'normals'):.1e}"
@@ -192,12 +194,12 @@ def _check_oriented(device: Device) -> str:
     """Compare normals of points in a volume of random HU: any of them may be doubtful."""
     volume = stack(random_integers((12, 40, 45), "int16", 100), np.eye(4), uneven=False)
     points = (_bumpy_sheet(2_500) + np.array([2.0, 2.0, 5.0], np.float32)).astype(np.float32)
-    gradients = gradients_twin.find_gradients(volume, points, 0.0)
-    axes, eigenvalues = filter_twin.principal_axes(points, filter_twin.find_neighbours(points, K)[0])
-    expected, doubtful = filter_twin.orient_by_gradients(axes, gradients)
+    gradients = cluster_twin.find_gradients(volume, points, 0.0)
+    axes, eigenvalues = neighbour_twin.principal_axes(points, neighbour_twin.find_neighbours(points, K)[0])
+    expected, doubtful = neighbour_twin.orient_by_gradients(axes, gradients)
     cosines = np.abs(np.einsum("ni,ni->n", axes, gradients)) / np.linalg.norm(gradients, axis=1)
     clear = (eigenvalues[:, 1] - eigenvalues[:, 0]) / eigenvalues[:, 2] > 0.03
-    clear &= (cosines > 0.01) & (np.abs(cosines - filter_twin.DOUBTFUL_COSINE) > 1e-3)
+    clear &= (cosines > 0.01) & (np.abs(cosines - neighbour_twin.DOUBTFUL_COSINE) > 1e-3)
     step = estimate_normals(PointCloud(points), K, volume=volume, device=device)
     assert step.cloud.normals is not None
     require_share(step.facts["doubtful"], int(doubtful.sum()), 10.0, 0.0, "number of doubtful normals")
@@ -212,7 +214,7 @@ def _check_gradients(device: Device, types: tuple[str, ...], uneven: bool) -> st
         points = volume.ijk_to_lps(np.random.default_rng(5).uniform(-1.0, last + 1.0, (2_000, 3)))
         resident = DeviceVolume(volume, device=device)
         slopes = find_gradients(resident, points, stopwatch=Stopwatch())
-        expected = gradients_twin.find_gradients(volume, points, resident.values.lowest)
+        expected = cluster_twin.find_gradients(volume, points, resident.values.lowest)
         worst = max(
             worst, require_share(slopes, expected, _GRADIENT_HU_MM, _OTHER_SIDE, f"gradients of {dtype} voxels")
         )
@@ -220,21 +222,21 @@ def _check_gradients(device: Device, types: tuple[str, ...], uneven: bool) -> st
 
 
 def _filtered(points: NDArray[np.float32], features: str | None, cells_edge: float = 0.0) -> NDArray[np.float64]:
-    indices, distances = filter_twin.find_neighbours(points, K)
-    axes, eigenvalues = filter_twin.principal_axes(points, indices)
-    scales = filter_twin.filter_scales(points, axes, indices, 2.0)
-    factors = filter_twin.bilateral_factors(points, axes, indices, *scales)
+    indices, distances = neighbour_twin.find_neighbours(points, K)
+    axes, eigenvalues = neighbour_twin.principal_axes(points, indices)
+    scales = neighbour_twin.filter_scales(points, axes, indices, 2.0)
+    factors = neighbour_twin.bilateral_factors(points, axes, indices, *scales)
     if features is not None:
         edge = np.float32(cells_edge)
         corner = (points.min(axis=0).astype(np.float64) - 1e-3 * float(edge)).astype(np.float32)
         steps = ((points - corner) * (np.float32(1.0) / edge)).astype(np.int64)
         cells = np.unique(steps, axis=0, return_inverse=True)[1].ravel()
         if features == "paper":
-            ratios = distance_ratios(filter_twin.mean_distances(distances), distances[:, 1], cells)
+            ratios = distance_ratios(neighbour_twin.mean_distances(distances), distances[:, 1], cells)
             is_feature = find_features(ratios, ratio_threshold(ratios))
         else:
             is_feature = eigenvalues[:, 0] / eigenvalues.sum(axis=1) > VARIATION_OF_FEATURES
-        factors = np.where(is_feature, factors, filter_twin.cell_factors(points, axes, cells, *scales))
+        factors = np.where(is_feature, factors, neighbour_twin.cell_factors(points, axes, cells, *scales))
     moved: NDArray[np.float64] = points - factors[:, None] * axes
     return moved
 
@@ -252,9 +254,9 @@ def _check_filter(device: Device) -> str:
 
 def _check_outliers(device: Device) -> str:
     points = _bumpy_sheet(9_000)
-    _, distances = filter_twin.find_neighbours(points, K)
+    _, distances = neighbour_twin.find_neighbours(points, K)
     step = remove_outliers(PointCloud(points), K, 1.0, device=device)
-    require_share(step.removed, filter_twin.find_outliers(distances, 1.0), 0.0, _OTHER_SIDE, "outliers")
+    require_share(step.removed, neighbour_twin.find_outliers(distances, 1.0), 0.0, _OTHER_SIDE, "outliers")
     require_equal(len(step.cloud), int(np.count_nonzero(step.removed == 0)), "points that are kept")
     return f"{int(step.removed.sum())} outliers of 9,000 points"
 
@@ -262,11 +264,7 @@ def _check_outliers(device: Device) -> str:
 FILTER_CHECKS = (
     Check("normals of points", ("fit_planes", "orient_normals"), _check_normals),
     Check("normals by the gradient", ("fit_planes", "orient_normals", "find_gradients"), _check_oriented),
-    Check(
-        "gradients at points",
-        ("find_gradients",),
-        partial(_check_gradients, types=("int8", "uint8", "int16", "uint16", "int32", "float32"), uneven=False),
-    ),
+    Check("gradients at points", ("find_gradients",), partial(_check_gradients, types=VOXEL_TYPES, uneven=False)),
     Check("gradients in uneven stacks", ("find_gradients",), partial(_check_gradients, types=("int16",), uneven=True)),
     Check("filter of points", ("fit_planes", "filter_points", "filter_cells", "measure_distances"), _check_filter),
     Check("outliers of points", ("measure_distances",), _check_outliers),
@@ -304,7 +302,7 @@ def _check_field(device: Device) -> str:
     field = NodeField(device, points, normals, SETTINGS)
     nodes, masks = field.nodes, field.masks
     h = SETTINGS.spacing
-    expected = twin.measure_field(
+    expected = field_twin.measure_field(
         points, normals, nodes.corner, h, nodes.shape, reach=SETTINGS.reach, smoothing=SETTINGS.smoothing
     )
     near = np.isfinite(expected.value) & (expected.squared <= np.float32(SETTINGS.bridge) ** 2)
@@ -316,7 +314,7 @@ def _check_field(device: Device) -> str:
     require_equal(negative[clear], expected.value[clear] <= 0.0, "signs of a field")
     require_equal(negative[~near], np.zeros(int((~near).sum()), bool), "signs far from a field")
     signs = decide_signs(masks, field.limits, ROUNDS)
-    decided = twin.decide_signs(near, core, negative, ROUNDS)
+    decided = field_twin.decide_signs(near, core, negative, ROUNDS)
     require_equal(
         (signs.votes, signs.against, signs.regions, signs.outside_is_inside),
         (decided.votes, decided.against, decided.regions, bool(decided.inside[0, 0, 0])),
@@ -324,7 +322,7 @@ def _check_field(device: Device) -> str:
     )
     require_equal(_fetch(masks, signs.inside_d), decided.inside, "nodes inside")
     far = float(np.float32(SETTINGS.bridge))
-    filled = twin.fill_nodes(expected, near, decided, far, LEAST_SHARE * h)
+    filled = field_twin.fill_nodes(expected, near, decided, far, LEAST_SHARE * h)
     apart = require_close(field.fill(signs), filled, _FIELD_MM, "the field on nodes")
     return f"{field.bricks} bricks of nodes within {apart:.1g} mm, signs of {nodes.count:,} nodes equal"
 

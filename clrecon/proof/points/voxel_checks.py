@@ -30,7 +30,6 @@ from clrecon.proof.checking import (
     require_whole,
     stack,
 )
-from clrecon.proof.points import clusters as cluster_twin
 from clrecon.proof.points import clusters as twin
 
 SHAPE = (26, 41, 70)
@@ -84,7 +83,7 @@ def _check_clusters(device: Device) -> str:
             search = ClusterSearch(device, mask, stencil, samples, parts_per_core=_MANY_PARTS)
             labels, cores = search.label(), search.flag_cores()
         ijk = np.argwhere((volume.voxels >= 75) & (volume.voxels <= 110))[:, ::-1]
-        count, expected, expected_cores = cluster_twin.cluster_points(volume.ijk_to_lps(ijk), eps, samples)
+        count, expected, expected_cores = twin.cluster_points(volume.ijk_to_lps(ijk), eps, samples)
         subject = f"at eps {eps} mm and min_samples {samples}"
         require_equal(search.count, count, f"the number of clusters {subject}")
         require_equal(cores, expected_cores, f"core points {subject}")

@@ -213,19 +213,9 @@ CHECKS = (
     Check(
         "triangles and layers",
         (
-            "place_vertices",
-            "count_pieces",
-            "draw_triangles",
-            "draw_pieces",
-            "shade_triangles",
-            "clear_rays",
-            "fill_depths",
-            "begin_layer",
-            "show_still",
-            "blend_layer",
-            "count_open",
-            "finish_rays",
+            "place_vertices", "count_pieces", "draw_triangles", "draw_pieces", "shade_triangles", "clear_rays",
+            "fill_depths", "begin_layer", "show_still", "blend_layer", "count_open", "finish_rays",
         ),
         _check_layers,
     ),
-)
+)  # fmt: skip

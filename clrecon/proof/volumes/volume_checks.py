@@ -20,6 +20,7 @@ from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.tables import compare_bricks, measure_bricks
 from clrecon.proof.checking import (
     OBLIQUE,
+    VOXEL_TYPES,
     Check,
     noise,
     random_integers,
@@ -29,7 +30,6 @@ from clrecon.proof.checking import (
     stack,
 )
 from clrecon.proof.volumes import volume_twins as twin
-from clrecon.proof.volumes.volume_twins import reformat_sheet
 from clrecon.rendering.views.reformation import find_plane, plane_sheet, slab_samples
 from clrecon.system.progress import ignore_progress
 
@@ -137,7 +137,7 @@ _BRICK_SHAPE = (221, 196, 21)
 
 
 def _check_bricks(device: Device) -> str:
-    for dtype in ("int8", "uint8", "int16", "uint16", "int32", "float32"):
+    for dtype in VOXEL_TYPES:
         voxels = noise(_BRICK_SHAPE, dtype, 120)
         rows = np.arange(-(-_BRICK_SHAPE[0] // 8) * -(-_BRICK_SHAPE[1] // 8)).reshape(-(-_BRICK_SHAPE[0] // 8), -1)
         # Some rows are all outside.
@@ -298,9 +298,8 @@ def _check_near_level(device: Device) -> str:
         require_equal(marked.reshape(expected.shape), expected, "groups near a level")
     settings = BilateralSettings.checked(volume, 0.8, 20.0, 2, 99.0, False, 13)
     near = run_bilateral(DeviceVolume(volume, device=device), settings)
-    whole = run_bilateral(
-        DeviceVolume(volume, device=device), BilateralSettings.checked(volume, 0.8, 20.0, 2, None, False, 13)
-    )
+    everywhere = BilateralSettings.checked(volume, 0.8, 20.0, 2, None, False, 13)
+    whole = run_bilateral(DeviceVolume(volume, device=device), everywhere)
     require_equal(near.voxels >= 99, whole.voxels >= 99, "sides of the level")
     return f"{int(expected.sum()):,} of {expected.size:,} groups"
 
@@ -309,7 +308,7 @@ FILTER_CHECKS = (
     Check(
         "bilateral filter",
         ("copy_row_ends", "filter_bilateral"),
-        partial(_check_bilateral, types=("int8", "uint8", "int16", "uint16", "int32", "float32"), uneven=False),
+        partial(_check_bilateral, types=VOXEL_TYPES, uneven=False),
     ),
     Check(
         "bilateral filter of uneven stacks",
@@ -339,17 +338,13 @@ def _check_sheets(device: Device, types: tuple[str, ...], uneven: bool) -> str:
             samples = slab_samples(volume, thickness)
             cut = sample_sheet(DeviceVolume(volume, device=device), sheet, samples, combine)
             require_whole({"slabs": cut.slabs, "warnings": ()})
-            expected = reformat_sheet(volume, sheet, samples, combine)
+            expected = twin.reformat_sheet(volume, sheet, samples, combine)
             worst = max(worst, require_close(cut.values, expected, VALUE_HU, f"slices of {dtype} voxels, in HU"))
     return f"{len(types) * len(PLANES)} slices of {SIZE[0]} x {SIZE[1]} pixels within {worst:.1e} HU"
 
 
 SHEET_CHECKS = (
-    Check(
-        "slices",
-        ("reformat_rows",),
-        partial(_check_sheets, types=("int8", "uint8", "int16", "uint16", "int32", "float32"), uneven=False),
-    ),
+    Check("slices", ("reformat_rows",), partial(_check_sheets, types=VOXEL_TYPES, uneven=False)),
     Check(
         "slices of uneven stacks",
         ("reformat_rows",),
