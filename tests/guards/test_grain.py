@@ -23,8 +23,8 @@ CEILINGS = {
 
 HABITS = {
     "functions_with_pronouns": 26,
-    "functions_without_object": 44,
-    "assignments_of_three": 19,
+    "functions_without_object": 43,
+    "assignments_of_three": 18,
     "nested_conditionals": 0,
     "comprehensions_of_two_loops": 23,
     "positional_flags": 0,
