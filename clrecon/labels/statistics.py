@@ -73,8 +73,7 @@ class LabelFigures(Record):
         if abs(self.ml - wanted) > _ODD_VOLUME * wanted:
             warnings.append(
                 f"{self.name} has {format_digits(self.ml, 4)} ml on the grid of the scan and"
-                f" {format_digits(wanted, 4)} ml on its own:"
-                " look at the slices of both"
+                f" {format_digits(wanted, 4)} ml on its own: look at the slices of both"
             )
         if self.unmeasured:
             warnings.append(f"{self.name}: {self.unmeasured:,} of {self.voxels:,} voxels have no finite value")

@@ -270,8 +270,7 @@ class Device:
         except LookupError as error:
             self.shortcoming = (
                 f"its compiler is older than this CPU and builds nothing for it ({error}): install PoCL 3.1 or newer"
-                " (pocl-opencl-icd of the system, or pocl of conda-forge) or"
-                f" `{install_command('intel-opencl-rt')}`"
+                f" (pocl-opencl-icd of the system, or pocl of conda-forge) or `{install_command('intel-opencl-rt')}`"
             )
         else:
             self.build_options += (f"-DCPU_NAME={self._cpu.name}",)

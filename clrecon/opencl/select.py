@@ -397,8 +397,7 @@ def find_candidates(name: str | int | None) -> tuple[list[Device], bool]:
     if not matches:
         raise DeviceError(
             f"no device to choose among {_list_for_message(devices)} (simulators must be named with"
-            f" {name_parameter('device')}):"
-            f" {driver_advice()}"
+            f" {name_parameter('device')}): {driver_advice()}"
         )
     return sorted(matches, key=lambda device: device.score, reverse=True), not is_named
 

@@ -276,6 +276,16 @@ def number_or_nan(value: Any) -> float:
         return math.nan
 
 
+def array_or_empty(values: Any) -> NDArray[np.float64]:
+    """Return `values` as an array of float64, an empty one where they hold anything else."""
+    import numpy as np
+
+    try:
+        return np.array(values, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return np.empty(0)
+
+
 def as_numbers(name: str, values: Any) -> NDArray[np.float64]:
     """Return an argument as an array of float64; a `UsageError` with its name where it holds anything else."""
     import numpy as np

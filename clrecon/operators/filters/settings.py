@@ -218,8 +218,7 @@ class BilateralSettings:
             return []
         return [
             f"the window of {window.taps:,} taps holds {100.0 * window.share:.0f} % of the weight that"
-            f" sigma_mm={self.sigma_mm:.3g} gives to {window.whole_taps:,}: the filter smooths"
-            " less far than asked for"
+            f" sigma_mm={self.sigma_mm:.3g} gives to {window.whole_taps:,}: the filter smooths less far than asked for"
         ]
 
     def as_report(self) -> dict[str, Any]:

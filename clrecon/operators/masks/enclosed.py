@@ -422,8 +422,7 @@ def _warn_of_spaces(facts: dict[str, Any]) -> list[str]:
         )
     if facts["filled_ml"] > facts["bone_ml"]:
         warnings.append(
-            f"solid: {format_ml(facts['filled_ml'])} were filled, more than the"
-            f" {format_ml(facts['bone_ml'])} of the bone"
-            " itself: see in a picture that it is marrow"
+            f"solid: {format_ml(facts['filled_ml'])} were filled, more than the {format_ml(facts['bone_ml'])}"
+            " of the bone itself: see in a picture that it is marrow"
         )
     return warnings

@@ -117,9 +117,8 @@ def choose_edge(cloud: PointCloud, *, device: Device | str | int | None = None, 
     if edge == 0.0:
         raise UsageError(
             f"over half of the {len(cloud):,} points have {neighbours.distances.shape[1] - 1} others at the same"
-            " place, so"
-            " that no edge of cells can be chosen: remove double points first (clrecon.thin_points with a small"
-            " spacing), or give an edge in mm"
+            " place, so that no edge of cells can be chosen: remove double points first (clrecon.thin_points with a"
+            " small spacing), or give an edge in mm"
         )
     return edge
 

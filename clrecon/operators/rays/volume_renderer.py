@@ -42,7 +42,7 @@ from clrecon.rendering.views.camera import Camera, box_corners
 from clrecon.rendering.views.clip import ShownLabels, check_center, find_seen_box
 from clrecon.rendering.views.directions import ANTERIOR, DEFAULT_SIZE, checked_size, default_view
 from clrecon.rendering.views.reformation import find_plane
-from clrecon.system.arguments import DirectionName, ModeName, ViewName, explains_arguments
+from clrecon.system.arguments import DirectionName, ModeName, ViewName, explains_arguments, number_or_nan
 from clrecon.system.light_dataclass import replace
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import list_names
@@ -317,10 +317,7 @@ class VolumeRenderer(VolumeWorker):
         finest = max(_SMALLEST_STEP * smallest, diagonal / _MOST_STEPS)
         if ray_step is None:
             return max(0.5 * smallest, finest)
-        try:
-            step = float(ray_step)
-        except (TypeError, ValueError, OverflowError):
-            step = math.nan
+        step = number_or_nan(ray_step)
         if finest <= step < math.inf:
             return min(step, 2.0 * diagonal)  # one sample, in the middle of the way through the volume
         raise UsageError(

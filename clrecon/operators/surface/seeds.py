@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.operators.resident.device_volume import DeviceVolume
-from clrecon.system.arguments import name_parameter
+from clrecon.system.arguments import array_or_empty, name_parameter
 from clrecon.system.light_dataclass import dataclass
 
 AUTO = "auto"
@@ -102,10 +102,7 @@ def _read_voxels(item: Any, resident: DeviceVolume) -> tuple[NDArray[np.bool_] |
 
 
 def _read_point(item: Any) -> NDArray[np.float64]:
-    try:
-        point = np.asarray(item, np.float64)
-    except (TypeError, ValueError, OverflowError):
-        point = np.empty(0)
+    point = array_or_empty(item)
     if point.shape != (3,) or not np.isfinite(point).all():
         raise UsageError(
             f"{name_parameter('grow_from')} is {AUTO!r}, a point of three numbers in LPS mm, a label or a mask,"

@@ -10,6 +10,7 @@ import numpy as np
 
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
+from clrecon.system.arguments import array_or_empty
 from clrecon.system.text import unknown_name
 
 COLORS = {
@@ -46,10 +47,7 @@ def find_color(color: str | Sequence[float]) -> Float64Array:
         if re.fullmatch("[0-9a-f]{6}", digits):
             return np.array([int(digits[at : at + 2], 16) / 255.0 for at in (0, 2, 4)])
     else:
-        try:
-            numbers = np.array(color, dtype=np.float64)
-        except (TypeError, ValueError, OverflowError):
-            numbers = np.empty(0)
+        numbers = array_or_empty(color)
         if numbers.shape == (3,) and (numbers >= 0.0).all() and (numbers <= 1.0).all():
             return numbers
     raise UsageError(f"{unknown_name('colour', color, COLORS)}, #rrggbb, or three numbers from 0 to 1")

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from clrecon.errors import UsageError
-from clrecon.system.arguments import number_or_nan
+from clrecon.system.arguments import array_or_empty, number_or_nan
 from clrecon.system.light_dataclass import dataclass
 
 LEAST_SOFT_GRADIENT = 0.01
@@ -68,10 +68,7 @@ class Lighting:
 
     @staticmethod
     def _unit(direction: Any) -> tuple[float, float, float]:
-        try:
-            vector = np.asarray(direction, dtype=np.float64)
-        except (TypeError, ValueError, OverflowError):
-            vector = np.empty(0)
+        vector = array_or_empty(direction)
         if vector.shape != (3,) or not np.isfinite(vector).all() or not vector.any():
             raise UsageError(
                 f"the direction of a light is three finite numbers in LPS that are not all 0, not {direction!r}"

@@ -13,6 +13,7 @@ from clrecon.errors import UsageError
 from clrecon.labels import LabelMap, file_suffixes
 from clrecon.rendering.looks.colors import find_color
 from clrecon.rendering.views.reformation import Sheet
+from clrecon.system.arguments import number_or_nan
 from clrecon.system.base_classes import Message
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.text import to_hexadecimal
@@ -96,10 +97,7 @@ def _by_number(labels: LabelMap, subject: str, mapping: Mapping | None) -> dict:
 
 
 def _check_opacity(name: str, factor: float) -> float:
-    try:
-        number = float(factor)
-    except (TypeError, ValueError, OverflowError):
-        number = float("nan")
+    number = number_or_nan(factor)
     if not 0.0 <= number <= 1.0:
         raise UsageError(f"the opacity of label {name} is a number from 0 to 1, not {factor!r}")
     return number

@@ -15,7 +15,7 @@ from numpy.typing import DTypeLike, NDArray
 from clrecon.errors import UsageError
 from clrecon.rendering.pictures.annotations import Bar, Drawing, PictureData, Text
 from clrecon.rendering.pictures.pillow import load_pillow
-from clrecon.system.arguments import explains_arguments, name_parameter
+from clrecon.system.arguments import explains_arguments, name_parameter, number_or_nan
 from clrecon.system.files import replace_file
 from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.paths import find_extension, keep_existing
@@ -374,10 +374,7 @@ _LEAST_DPI, _MOST_DPI = 36.0, 4800.0
 
 def checked_dpi(dpi: Any) -> float:
     """Return a resolution in pixels per inch, or refuse it."""
-    try:
-        value = float(dpi)
-    except (TypeError, ValueError, OverflowError):
-        value = 0.0
+    value = number_or_nan(dpi)
     if not _LEAST_DPI <= value <= _MOST_DPI:
         raise UsageError(f"a figure has {_LEAST_DPI:g} to {_MOST_DPI:,.0f} pixels per inch, not {dpi!r:.60}")
     return value

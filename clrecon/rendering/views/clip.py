@@ -16,6 +16,7 @@ from clrecon.geometry.grid import Grid
 from clrecon.geometry.volume import Volume
 from clrecon.rendering.views.camera import box_between, box_corners
 from clrecon.rendering.views.directions import checked_vector
+from clrecon.system.arguments import array_or_empty
 from clrecon.system.base_classes import Message
 
 
@@ -67,10 +68,7 @@ class Clip(Message):
         UsageError
             Not three numbers each, or ``low`` is not below ``high``.
         """
-        try:
-            corners = np.array([low, high], dtype=np.float64)
-        except (TypeError, ValueError, OverflowError):
-            corners = np.empty(0)
+        corners = array_or_empty([low, high])
         if corners.shape != (2, 3) or np.isnan(corners).any():
             raise UsageError(f"a clip box has two corners of three numbers in LPS mm, not {low!r} and {high!r}")
         for axis, (below, above) in zip("xyz", corners.T, strict=True):

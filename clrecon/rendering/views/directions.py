@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.grid import Grid
-from clrecon.system.arguments import DirectionName, name_parameter
+from clrecon.system.arguments import DirectionName, array_or_empty, name_parameter
 from clrecon.system.text import unknown_name
 
 DIRECTIONS: dict[str, tuple[float, float, float]] = {
@@ -37,10 +37,7 @@ def as_point(vector: Any) -> tuple[float, float, float]:
 
 def checked_vector(subject: str, value: ArrayLike) -> tuple[float, float, float]:
     """Return three finite numbers as floats."""
-    try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        array = np.empty(0)
+    array = array_or_empty(value)
     if array.shape != (3,) or not np.isfinite(array).all():
         raise UsageError(f"{subject} is three finite numbers in LPS mm, not {value!r}")
     return float(array[0]), float(array[1]), float(array[2])
