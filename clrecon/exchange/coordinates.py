@@ -13,7 +13,7 @@ from clrecon.system.pieces import find_bounds, in_threads
 
 _MOST_STEPS_APART = 64
 
-_PIECE = 1 << 17
+_PIECE = 1 << 16
 """Vertices that are searched at a time for those at one place, in the processor's cache."""
 
 
@@ -101,7 +101,7 @@ def _find_firsts(vertices: NDArray[np.floating]) -> NDArray[np.int64]:
     mixed, left = _scramble(vertices), np.arange(len(vertices))
     firsts = np.empty_like(left)
     while len(left):
-        bits = len(left).bit_length() + 1
+        bits = len(left).bit_length()
         slots = mixed[left] >> np.uint64(64 - bits)
         table = np.empty(1 << bits, np.int64)
         table[slots[::-1]] = left[::-1]  # the first of equals, as it is the last that is written
