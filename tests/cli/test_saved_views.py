@@ -120,6 +120,14 @@ def test_picture_without_a_saved_view_is_the_first_of_the_view(device: Any, scan
     assert (tmp_path / "drawn.png").read_bytes() == (tmp_path / "first.png").read_bytes()
 
 
+def test_saved_view_without_its_scan_is_refused_with_the_way_to_open_it(tmp_path: Path, printed: Any) -> None:
+    (tmp_path / "shown.view.json").write_text("{}")
+
+    assert main(["view", str(tmp_path / "shown.view.json"), "--no-open"]) == 3
+
+    printed().assert_error("--state")
+
+
 @pytest.mark.opencl
 def test_view_of_a_scan_begins_with_bone_without_the_table_and_says_what_was_taken(device: Any, scan: Path) -> None:
     with open_scan(scan, device) as view, view.session() as session:

@@ -108,6 +108,9 @@ def _tell_kind(path: str | Path) -> str:
     file = Path(path)
     refuse_other_clouds(path)
     suffix = file.suffix.lower()
+    if file.name.lower().endswith(".view.json"):
+        advice = f"name the scan that it was saved of, and this file with {name_parameter('state')}"
+        raise UsageError(f"{escape_text(file.name)} is a saved view, without voxels: {advice}")
     if suffix not in MESH_INPUTS and not is_cloud_file(file):
         return "scan"
     if not file.is_file():
@@ -155,15 +158,15 @@ def _open_cloud(path: str | Path, space: Space | None) -> OpenedInput:
 
 def _open_scan(path: str | Path, settings: ViewSettings, progress: Progress, read: Reader) -> OpenedInput:
     """Read a scan, and mask and crop it; a file of whole numbers from 0 is a label map."""
-    from clrecon.labels.reader import is_dicom_map
+    from clrecon.labels.reader import is_dicom_map, read_labels
 
     scan, name = settings.scan, escape_text(Path(path).name)
     if tell_format(path) is None and is_dicom_map(path):
-        labels = _read_labels(path)
+        labels = read_labels(path)
         return OpenedInput(labels, labels.warnings)
     volume = read(path, scan, progress=progress)
     if tell_format(path) is not None and _holds_labels(volume):
-        labels = _read_labels(path)
+        labels = read_labels(path)
         note = f"{name} is taken for a label map: its values are whole numbers from 0"
         return OpenedInput(labels, (note, *labels.warnings))
     volume = mask_volume(volume, scan, progress)
@@ -174,12 +177,6 @@ def _open_scan(path: str | Path, settings: ViewSettings, progress: Progress, rea
         volume = restrict_volume(volume, scan, device, [], progress)
         volume = preprocess_volume(volume, scan, device, [], progress)
     return OpenedInput(volume, tuple(volume.report.get("warnings", ())), dict(volume.report))
-
-
-def _read_labels(path: str | Path) -> LabelMap:
-    from clrecon.labels import read_labels
-
-    return read_labels(path)
 
 
 def _holds_labels(volume: Volume) -> bool:
