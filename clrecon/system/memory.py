@@ -9,12 +9,12 @@ from __future__ import annotations
 import math
 import mmap
 import os
+import shutil
 import stat
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from shutil import disk_usage
 from typing import Any
 
 import numpy as np
@@ -78,7 +78,7 @@ def _map_temporary(shape: Sequence[int], dtype: np.dtype[Any], needed: int, prob
     """Map a new file without a name, whose room on the disk is taken before anything is written."""
     folder = tempfile.gettempdir()
     advice = "and the folder for temporary files has no room for it: name another with TMPDIR"
-    if needed > _DISK_SHARE * disk_usage(folder).free:
+    if needed > _DISK_SHARE * shutil.disk_usage(folder).free:
         raise RefusedInputError(f"{problem}, {advice}")
     try:
         with tempfile.TemporaryFile(prefix="clrecon-", dir=folder) as file:
