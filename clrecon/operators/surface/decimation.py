@@ -213,7 +213,7 @@ def follow_crossings(
     if count < fewest or vertices.dtype != np.float32:
         return None
     plan = plan_crossings(vertices, triangles, rows)
-    spare = plan.stride // 8
+    spare = plan.stride // 4
     needs = {**plan.needs(), "changed triangles": _ENTRY_BYTES * spare}
     has_room = not ocl.describe_shortage(ocl.memory_limits(device, memory), needs)
     return CrossingMarks(device, plan, spare=spare) if has_room else None
