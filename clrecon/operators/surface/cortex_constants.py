@@ -127,7 +127,7 @@ class _Trial(NamedTuple):
         return self._replace(**{self._fields[axis]: self[axis] * factor for axis in axes})
 
 
-class _Found(NamedTuple):
+class _Outcome(NamedTuple):
     """What a search came to: constants, how many walls are thick enough to show their HU, and whether steps up told it:
     walls that are alike with it were not so with less, so that nothing denser describes them as well."""
 
@@ -174,8 +174,8 @@ def measure_constants(
     except UsageError:  # a specimen in air
         noise = None
     walls = _Walls(sampler, values, noise)
-    found = _search(walls, volume)
-    return _measure_errors(walls, found.trial, found.thick, _find_denser(walls, found))
+    outcome = _search(walls, volume)
+    return _measure_errors(walls, outcome.trial, outcome.thick, _find_denser(walls, outcome))
 
 
 def _measure_errors(
@@ -213,10 +213,10 @@ def _are_alike(walls: _Walls, trial: _Trial) -> bool:
     return bool(thick < _ALIKE_THICK * thin and np.median(ratios) < _THIN_BLURS)
 
 
-def _find_denser(walls: _Walls, found: _Found) -> tuple[_Trial, _Trial] | None:
+def _find_denser(walls: _Walls, outcome: _Outcome) -> tuple[_Trial, _Trial] | None:
     """Return what is taken of the constants that describe alike walls as well, and their dense end; None for one."""
-    trial = found.trial
-    if found.is_told or not _are_alike(walls, trial):
+    trial = outcome.trial
+    if outcome.is_told or not _are_alike(walls, trial):
         return None
     end, least = trial, _left(walls, slice(None), trial)
     most = min(_MOST_DENSER * trial.cortex_hu, METAL_HU)
@@ -257,13 +257,13 @@ def find_groups(
         if not _may_differ(sampler, values, scan):
             continue
         walls = _Walls(sampler, values, scan.noise_hu)
-        found = _search(walls, volume)
-        cortex_hu = found.trial.cortex_hu
-        is_bone = found.thick >= _FEWEST_THICK and cortex_hu >= COMPACT_HU
+        outcome = _search(walls, volume)
+        cortex_hu = outcome.trial.cortex_hu
+        is_bone = outcome.thick >= _FEWEST_THICK and cortex_hu >= COMPACT_HU
         if is_bone and abs(cortex_hu - scan.cortex_hu) > _DIFFERENT * scan.cortex_hu:
-            if scan.denser is not None and _find_denser(walls, found) is not None:
+            if scan.denser is not None and _find_denser(walls, outcome) is not None:
                 continue
-            groups.append((rows, _measure_errors(walls, found.trial, found.thick)))
+            groups.append((rows, _measure_errors(walls, outcome.trial, outcome.thick)))
             left[rows] = False
     return [(np.flatnonzero(left), scan), *groups]
 
@@ -301,7 +301,7 @@ def _may_differ(sampler: ProfileSampler, values: Float32Array, scan: CortexConst
     return thick < _FEWEST_THICK or abs(shown - scan.cortex_hu) > _ALIKE * scan.cortex_hu
 
 
-def _search(walls: _Walls, volume: Volume) -> _Found:
+def _search(walls: _Walls, volume: Volume) -> _Outcome:
     """Return the constants that describe the profiles."""
     values = walls.values
     dense, usual = np.percentile(values[: CENTRE + 2].max(axis=0), (95.0, _DENSE_PERCENTILE)).tolist()
@@ -318,10 +318,10 @@ def _search(walls: _Walls, volume: Volume) -> _Found:
         best = candidate
         cortex_hu, thick = _measure_cortex(walls, slice(None), best)
     if not shown:
-        return _Found(_search_upwards(walls, best._replace(cortex_hu=cortex_hu)), thick)
+        return _Outcome(_search_upwards(walls, best._replace(cortex_hu=cortex_hu)), thick)
     best = _step_cortex(walls, best, 1.0 / _CORTEX_STEP)
-    told = _step_cortex(walls, best, _UPWARD_STEP) if _may_be_denser(walls, best) else best
-    return _Found(told, thick, is_told=told is not best)
+    denser = _step_cortex(walls, best, _UPWARD_STEP) if _may_be_denser(walls, best) else best
+    return _Outcome(denser, thick, is_told=denser is not best)
 
 
 def _step_cortex(walls: _Walls, best: _Trial, step: float) -> _Trial:

@@ -53,14 +53,14 @@ def box_corners(volume: Grid) -> Float64Array:
     return volume.ijk_to_lps(np.column_stack([i.ravel(), j.ravel(), k.ravel()]))
 
 
-SMALLEST_SIDE_MM = 1e-3
+_SMALLEST_SIDE_MM = 1e-3
 """Least side of a box, so that its affine can be inverted and a camera has a view direction and a height."""
 
 
 def box_between(low: ArrayLike, high: ArrayLike) -> Grid:
     """Return the box between two corners, LPS mm, as a grid of one voxel, which `Camera.fit` places a camera for."""
     lowest, highest = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
-    affine = np.diag([*np.maximum(highest - lowest, SMALLEST_SIDE_MM), 1.0])
+    affine = np.diag([*np.maximum(highest - lowest, _SMALLEST_SIDE_MM), 1.0])
     affine[:3, 3] = 0.5 * (lowest + highest)
     return Grid(np.zeros((1, 1, 1), np.int8), affine)
 
