@@ -1,7 +1,7 @@
 """The spinal canal of an adult: a centre line for curved reformations, and the ends of the canal (docs/slices.md).
 
-The path is the canal where it agrees over enough height.  Beyond the sure slices the place of the canal is known, so
-less is needed of the next slice: left and right may differ, as in a scan that is cropped at one side.  All other traits
+The path is the canal where it agrees over enough height.  Beyond these slices the place of the canal is known, so less
+is needed of the next slice: left and right may differ, as in a scan that is cropped at one side.  All other traits
 stay: without the vertebral body in front the way would go on in the soft tissue before the sacrum.
 """
 

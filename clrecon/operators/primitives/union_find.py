@@ -19,7 +19,7 @@ _LARGEST_MESH = 2**32 - 1
 """Most triangles, so that 32 bits can count them."""
 
 _MOST_CORNERS = 2**32 - 1
-"""Most corners, which have numbers of 32 bits, and one that is none."""
+"""Most corners of triangles: they are numbered in 32 bits, and `NO_CORNER` of fans.cl is the last number."""
 
 _MOST_PASSES = 1000
 """Limit of passes, far above the need of 2^31 vertices: 62 rounds of at most 11 passes each."""

@@ -193,11 +193,12 @@ def solid_cylinder(radius: float) -> Volume:
     return Volume(np.rint(50.0 + 950.0 * inside).astype(np.int16), np.eye(4))
 
 
-# Without what each of them needs 1,232, 1,365 and 853 HU were found.
+# Without what each of them needs 1,232, 1,365, 853 and 1,405 HU were found.
 HARD_SCANS = {
     "solid bone": noisy(solid_cylinder(11.0), 20.0, seed=2),  # measured 1,012
     "few thick walls": noisy(two_walls(2.2, 4.0, 0.7, blur=1.3), 30.0, seed=1),  # 997
     "thick walls that show too little": noisy(two_walls(0.8, 2.4, 0.4, blur=1.1, inner=400.0), 10.0, seed=1),  # 960
+    "thick walls that are alike": hollow_ball(thickness=2.0),  # 1,007
 }
 
 
