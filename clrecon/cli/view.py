@@ -32,7 +32,8 @@ examples:
   clrecon view CT_FOLDER bone.stl cloud.ply --labels spine.nii.gz --save-as shown.3mf
   clrecon view CT_FOLDER --no-open --port 8000
   clrecon view CT_FOLDER --window
-  clrecon view CT_FOLDER --state shown.view.json
+  clrecon view shown.view.json CT_FOLDER
+  clrecon view shown.view.json
   clrecon view CT_FOLDER --state shown.view.json --picture shown.png
   clrecon view CT_FOLDER --html page.html --with-slices
   clrecon view CT_FOLDER --html spine.html --labels spine.nii.gz
@@ -46,8 +47,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "inputs",
         metavar="INPUT",
         nargs="*",
-        help="file of a mesh or cloud, or a scan: DICOM folder or file, NIfTI, NRRD or MetaImage file (default: a page"
-        " where files are dropped)",
+        help="file of a mesh or cloud, or a scan: DICOM folder or file, NIfTI, NRRD or MetaImage file; a saved view"
+        " (.json) is shown of the other inputs (default: a page where files are dropped)",
     )
     shown = parser.add_argument_group("what is shown")
     shown.add_argument("--html", metavar="FILE", help="write a page that shows the inputs: .html", first=True)
@@ -81,6 +82,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
+    _take_saved_view(options)
     _check_faces(options)
     if options.window:
         return _show_window(options, console)
@@ -101,6 +103,16 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
 def _settings(options: argparse.Namespace) -> ViewSettings:
     return common.make_settings(ViewSettings, options, scan=MeshSettings(**mesh_fields(vars(options))))
+
+
+def _take_saved_view(options: argparse.Namespace) -> None:
+    """Take a saved view among the inputs for that of --state."""
+    saved = [path for path in options.inputs if path.lower().endswith(".json")]
+    if len(saved) + (options.state is not None) > 1:
+        raise UsageError("one saved view can be shown at a time: leave the others, or --state, out")
+    if saved:
+        (options.state,) = saved
+        options.inputs = [path for path in options.inputs if path not in saved]
 
 
 def _check_faces(options: argparse.Namespace) -> None:

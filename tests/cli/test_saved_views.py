@@ -120,12 +120,23 @@ def test_picture_without_a_saved_view_is_the_first_of_the_view(device: Any, scan
     assert (tmp_path / "drawn.png").read_bytes() == (tmp_path / "first.png").read_bytes()
 
 
-def test_saved_view_without_its_scan_is_refused_with_the_way_to_open_it(tmp_path: Path, printed: Any) -> None:
+def test_input_that_is_no_saved_view_is_refused_before_anything_is_served(tmp_path: Path, printed: Any) -> None:
     (tmp_path / "shown.view.json").write_text("{}")
 
-    assert main(["view", str(tmp_path / "shown.view.json"), "--no-open"]) == 3
+    assert main(["view", str(tmp_path / "shown.view.json"), "--no-open"]) == 4
 
-    printed().assert_error("--state")
+    printed().assert_error("shown.view.json", "schema")
+
+
+@pytest.mark.opencl
+def test_saved_view_among_the_inputs_is_that_of_the_others(
+    device: Any, scan: Path, saved: Path, tmp_path: Path
+) -> None:
+    arguments = ["view", str(saved / "shown.view.json"), str(scan), "--picture", str(tmp_path / "again.png")]
+
+    assert main([*arguments, "--size", "160x120", "--device", str(device.index)]) == 0
+
+    assert (tmp_path / "again.png").read_bytes() == (saved / "shown.png").read_bytes()
 
 
 @pytest.mark.opencl
@@ -172,6 +183,7 @@ REFUSED = {
     "size that is none": (["--picture", "a.png", "--size", "large"], 3, "large"),
     "picture of an animation": (["--picture", "a.gif"], 3, ".gif"),
     "picture and port": (["--picture", "a.png", "--port", "8000"], 3, "--port"),
+    "two saved views": (["a.view.json", "--state", "b.view.json"], 3, "--state"),
     "saved view that is missing": (["--state", "gone.view.json", "--picture", "a.png"], 3, "gone.view.json"),
 }
 

@@ -15,11 +15,11 @@ from clrecon.rendering.views.camera import Camera, describe_camera
 from clrecon.rendering.views.directions import checked_vector
 from clrecon.system.paths import read_regular
 from clrecon.system.records import name_schema
-from clrecon.system.text import escape_text
+from clrecon.system.text import count_of, escape_text
 from clrecon.viewer.model.changes import copy_view
 from clrecon.viewer.model.measures import POINTS_OF, REGIONS, Measure, checked_measure_name, measure_points
 from clrecon.viewer.model.model import ViewModel, checked_slab
-from clrecon.viewer.model.objects import ShownObject, first_parts
+from clrecon.viewer.model.objects import ShownObject, ShownScan, first_parts
 from clrecon.viewer.model.planes import check_plane, checked_turn
 from clrecon.viewer.model.state import LEAST_ZOOM, MOST_ZOOM, ClipPlane, ShownPart, SliceFrame, ViewState
 
@@ -33,6 +33,7 @@ def encode_view(state: ViewState, objects: Sequence[ShownObject]) -> bytes:
     """Return the content of a file from which `restore_view` shows the same again; no name of an input is in it."""
     facts = {
         "objects": [each.kind for each in objects],
+        "grids": _describe_grids(objects),
         "mode": state.mode,
         "iso_value_hu": state.iso_value,
         "window_hu": list(state.window),
@@ -62,6 +63,18 @@ def encode_view(state: ViewState, objects: Sequence[ShownObject]) -> bytes:
         "camera": describe_camera(state.camera),
     }
     return (json.dumps(name_schema(_SCHEMA, facts), indent=1) + "\n").encode("ascii")
+
+
+def _describe_grids(objects: Sequence[ShownObject]) -> list[dict[str, Any]]:
+    volumes = [each.volume for each in objects if isinstance(each, ShownScan)]
+    return [
+        {
+            "shape_ijk": list(each.shape_ijk),
+            "spacing_mm": np.round(each.spacing, 4).tolist(),
+            "origin_lps_mm": np.round(each.affine[:3, 3], 4).tolist(),
+        }
+        for each in volumes
+    ]
 
 
 def _describe_frame(frame: SliceFrame) -> dict[str, Any]:
@@ -102,6 +115,23 @@ def read_view(path: str | Path) -> dict[str, Any]:
     return saved
 
 
+def say_source(saved: Mapping[str, Any]) -> str:
+    """Return of which input a saved view is, in words; one of several inputs, which have to be named, is refused."""
+    try:
+        kinds = _say_kinds(saved["objects"])
+        grids = "".join(f" of {_say_grid(grid)}" for grid in saved.get("grids", ()))
+    except (KeyError, TypeError, ValueError) as error:
+        raise RefusedInputError(f"the saved view is damaged: {escape_text(str(error), 120)}") from None
+    if len(saved["objects"]) != 1:
+        raise UsageError(f"the saved view is of {kinds}: name these inputs too, in this order")
+    return f"a {kinds}{grids}"
+
+
+def _say_grid(grid: Mapping[str, Any]) -> str:
+    (ni, nj, nk), spacing = grid["shape_ijk"], " x ".join(f"{mm:.4g}" for mm in grid["spacing_mm"])
+    return f"{count_of(nk, 'slice')} of {ni} x {nj}, spacing {spacing} mm"
+
+
 def carry_view(saved: Mapping[str, Any]) -> dict[str, Any]:
     """Return what of a saved view of one scan, alone or with a label map, holds for scans of other patients too.
 
@@ -116,7 +146,9 @@ def carry_view(saved: Mapping[str, Any]) -> dict[str, Any]:
         looks = [each for each in saved["parts"] if each["kind"] not in ("cluster", "rest")]
     except (KeyError, TypeError) as error:
         raise RefusedInputError(f"the saved view is damaged: {escape_text(str(error), 120)}") from None
-    of_patient: dict[str, Any] = {"turn": None, "compare": None, "slices": [], "measures": [], "clip_box_lps_mm": None}
+    of_patient: dict[str, Any] = {
+        "grids": [], "turn": None, "compare": None, "slices": [], "measures": [], "clip_box_lps_mm": None,
+    }  # fmt: skip
     return {**saved, **of_patient, "parts": looks}
 
 
@@ -151,6 +183,12 @@ def _apply(saved: Mapping[str, Any], trial: ViewModel) -> None:
     kinds = [each.kind for each in trial.objects]
     if saved["objects"] != kinds:
         raise UsageError(f"it is of {_say_kinds(saved['objects'])}, and here are {_say_kinds(kinds)}")
+    for grid, here in zip(saved.get("grids", ()), _describe_grids(trial.objects), strict=False):
+        if grid != here:
+            origins = " to ".join(", ".join(f"{mm:.1f}" for mm in each["origin_lps_mm"]) for each in (grid, here))
+            if (same := _say_grid(here)) != _say_grid(grid):
+                raise UsageError(f"it is of a scan of {_say_grid(grid)}, and here is one of {same}")
+            raise UsageError(f"it is of another scan of {same}: the first voxel is moved from {origins} mm LPS")
     trial.set_mode(saved["mode"])
     low, high = saved["window_hu"]
     trial.set_window(low, high)

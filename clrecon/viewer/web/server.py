@@ -451,9 +451,8 @@ def serve_view(
     settings = settings or ViewSettings()
     check_view_settings(settings)
     check_names(save_as)
-    given = [name for name, value in (("state", settings.state), ("labels", settings.scan.labels)) if value is not None]
-    if given and not inputs:
-        raise UsageError(f"{name_parameter(given[0])} belongs to an input: name a scan or a mesh too")
+    if settings.scan.labels is not None and not inputs:
+        raise UsageError(f"{name_parameter('labels')} belongs to an input: name a scan or a mesh too")
     with ExitStack() as stack:
         room = None if inputs else StartRoom(settings)
         server = stack.enter_context(WebServer(port, save_as=save_as, wrote=wrote, start=room))

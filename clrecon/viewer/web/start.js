@@ -15,6 +15,12 @@
     find("said").classList.toggle("wrong", wrong);
   }
 
+  // A saved view that waits for the scan that it belongs to.
+  function showWaiting(words) {
+    find("waiting").hidden = !words;
+    find("waiting").firstElementChild.textContent = `A saved view is waiting. It was saved from ${words}: choose or drop what it belongs to.`;
+  }
+
   function showProgress(share) {
     find("bar").hidden = share === null;
     if (share === undefined) find("bar").removeAttribute("value");
@@ -64,7 +70,9 @@
       await Promise.all(Array.from({ length: AT_A_TIME }, work));
       say("Looking what it is.");
       showProgress(undefined);
-      showChoices((await ask("list")).choices);
+      const { choices, waiting } = await ask("list");
+      showWaiting(waiting);
+      showChoices(choices, waiting);
     } catch (error) {
       say(error.message, true);
     } finally {
@@ -73,8 +81,8 @@
     }
   }
 
-  function showChoices(choices) {
-    say(choices.length ? "" : "Nothing in it can be shown: DICOM, NIfTI, NRRD, MetaImage, STL, PLY and other meshes and clouds can.", true);
+  function showChoices(choices, waiting) {
+    say(choices.length || waiting ? "" : "Nothing in it can be shown: DICOM, NIfTI, NRRD, MetaImage, STL, PLY and other meshes and clouds can.", true);
     find("title").hidden = !choices.length;
     const ready = choices.filter(({ button }) => button).length;
     find("title").textContent = `${ready} of ${choices.length} can be opened`;
@@ -122,6 +130,9 @@
       clearInterval(timer);
     }
   }
+
+  ask("progress").then(({ waiting }) => showWaiting(waiting));
+  find("forget").onclick = () => { ask("forget").then(() => { showWaiting(""); say(""); }); };
 
   const picked = (input) => [...input.files].map((file) => [file.webkitRelativePath || file.name, file]);
   for (const [button, input] of [["folder", "pickfolder"], ["files", "pickfiles"]]) {

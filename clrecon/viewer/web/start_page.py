@@ -21,6 +21,7 @@ from clrecon.system.base_classes import Closing
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.log import get_logger
 from clrecon.system.text import escape_text
+from clrecon.viewer.model.saved_view import VIEW_FORMAT, read_view, say_source
 from clrecon.viewer.session.choices import Choice, checked_choice, find_choices, find_saved_view
 from clrecon.viewer.session.opening import OpenedView, open_view
 from clrecon.viewer.session.session import ViewSession
@@ -50,11 +51,15 @@ class Limits:
 class StartRoom(Closing):
     """What was dropped, what can be opened of it, and the view that was opened.
 
-    settings: With which views begin; the choice adds the part that is read.
+    settings: With which views begin; the choice adds the part that is read.  Their saved view waits for its scan.
     """
 
     def __init__(self, settings: ViewSettings, limits: Limits = Limits()) -> None:  # noqa: B008 (it is frozen)
-        self.settings, self.limits = settings, limits
+        self.settings, self.limits = replace(settings, state=None), limits
+        self._waiting: str | None = None
+        self.waiting = ""  # words of the saved view that waits for its scan
+        if settings.state is not None:
+            self._wait_with(settings.state)
         self.view: OpenedView | None = None
         self.progress: tuple[str, int, int] = ("", 0, 0)
         self.choices: list[Choice] = []
@@ -67,6 +72,13 @@ class StartRoom(Closing):
     def settle(self, folder: Path) -> None:
         """Take a private folder for what is dropped."""
         self.folder = folder
+
+    def _wait_with(self, path: str) -> None:
+        self._waiting, self.waiting = path, say_source(read_view(path))
+
+    def forget(self) -> None:
+        """Open what comes next without the saved view that waits."""
+        self._waiting, self.waiting = None, ""
 
     def close(self) -> None:
         _close_all((self._first, self.view))
@@ -110,15 +122,18 @@ class StartRoom(Closing):
             raise UsageError("the disk of temporary files is full: name another folder for them with TMPDIR")
 
     def list_choices(self) -> list[dict[str, Any]]:
-        """List what can be opened of the drop; it takes a while."""
+        """List what can be opened of the drop; it takes a while.  A saved view that comes alone waits for its scan."""
         self._archives.close()
         self.choices = find_choices(self._place(), self._archives, self._tell)
+        saved = find_saved_view(self._place())
+        if saved is not None and not self.choices:
+            self._wait_with(str(saved.replace(self._place().with_name(f"waiting{VIEW_FORMAT}"))))
         return [choice.describe() for choice in self.choices]
 
     def open(self, number: Any) -> Callable[[], None]:
-        """Open a choice, as the saved view that was dropped with it says; returns what closes the one that was open."""
+        """Open a choice, by the saved view that waits or was dropped with it; returns what closes the one before."""
         choice = checked_choice(self.choices, number)
-        saved = find_saved_view(self._place())
+        saved = self._waiting or find_saved_view(self._place())
         part = {field.name: getattr(choice.selection, field.name) for field in fields(Selection)}
         given = {name: value for name, value in part.items() if value not in (None, False)}
         settings = replace(self.settings, scan=replace(self.settings.scan, **given))
@@ -132,6 +147,7 @@ class StartRoom(Closing):
             raise
         before = (self._first, self.view)
         self.view, self._first = view, first
+        self.forget()
         first.prepare()
         return lambda: _close_all(before)
 
@@ -173,7 +189,7 @@ class StartDoors:
         self._lock = asyncio.Lock()
 
     def add_to(self, application: web.Application) -> None:
-        for name in ("begin", "upload", "list", "open"):
+        for name in ("begin", "upload", "list", "open", "forget"):
             application.router.add_post(f"/start/{name}", getattr(self, f"_{name}"))
         application.router.add_get("/start/progress", self._progress, allow_head=False)
 
@@ -206,9 +222,13 @@ class StartDoors:
 
     async def _list(self, request: web.Request) -> web.Response:
         async def list_choices() -> dict[str, Any]:
-            return {"choices": await asyncio.to_thread(self._room.list_choices)}
+            return {"choices": await asyncio.to_thread(self._room.list_choices), "waiting": self._room.waiting}
 
         return await self._work(list_choices)
+
+    async def _forget(self, request: web.Request) -> web.Response:
+        self._room.forget()
+        return _answer({})
 
     async def _open(self, request: web.Request) -> web.Response:
         number = request.query.get("choice", "")
@@ -235,7 +255,7 @@ class StartDoors:
 
     async def _progress(self, request: web.Request) -> web.Response:
         stage, done, total = self._room.progress
-        return _answer({"stage": stage, "done": done, "total": total})
+        return _answer({"stage": stage, "done": done, "total": total, "waiting": self._room.waiting})
 
 
 def _answer(content: dict[str, Any]) -> web.Response:

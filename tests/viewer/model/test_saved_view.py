@@ -13,6 +13,7 @@ from refusals import refused
 from report_schemas import find_faults
 
 from clrecon.errors import RefusedInputError, UsageError
+from clrecon.geometry import Volume
 from clrecon.viewer.model.model import ViewModel
 from clrecon.viewer.model.objects import show_objects
 from clrecon.viewer.model.saved_view import encode_view, read_view, restore_view
@@ -195,6 +196,23 @@ DAMAGED: dict[str, tuple[dict[str, Any], str]] = {
     "camera missing": ({"camera": None}, "damaged"),
     "clips that are no list": ({"clips": 3}, "damaged"),
 }
+
+
+MOVED = scenes.AFFINE.copy()
+MOVED[0, 3] += 3.0
+
+OTHERS = {
+    "fewer slices": (scenes.make_scan().voxels[2:], scenes.AFFINE, 20),
+    "another place": (scenes.make_scan().voxels, MOVED, -57.0),
+}
+
+
+@pytest.mark.parametrize(("voxels", "affine", "fact"), OTHERS.values(), ids=OTHERS)
+def test_view_of_another_scan_is_refused_with_what_tells_them_apart(voxels: Any, affine: Any, fact: float) -> None:
+    other = make_model(Volume(voxels, affine), MESH())
+
+    with refused(RefusedInputError, 22, fact):
+        restore_view(save(make_model()), other)
 
 
 @pytest.mark.parametrize(("entries", "fact"), DAMAGED.values(), ids=DAMAGED)

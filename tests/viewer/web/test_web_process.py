@@ -167,10 +167,7 @@ def test_fault_that_the_view_logs_is_printed_with_its_trace(monkeypatch, capsys:
     assert not logging.getLogger("clrecon.viewer").handlers, "what listened is gone with the view"
 
 
-@pytest.mark.parametrize(
-    "options",
-    [["--no-open", "--labels", "map.nii.gz"], ["--no-open", "--state", "shown.view.json"], ["--html", "page.html"]],
-)
+@pytest.mark.parametrize("options", [["--no-open", "--labels", "map.nii.gz"], ["--html", "page.html"]])
 def test_option_of_an_input_without_one_is_refused_by_its_name(options: list[str], printed: Printer) -> None:
     assert main(["view", *options]) == 3
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import http.client
 import json
 import shutil
@@ -17,10 +18,16 @@ import pytest
 import view_scenes as scenes
 from browser import severe_lines, wait_for
 from dicom_series import Plan, write_series
-from web_views import PATIENCE, get_path, secret_of, serving
+from refusals import refused
+from web_views import PATIENCE, browsing, get_path, secret_of, serving
 
+from clrecon.errors import UsageError
+from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.view import ViewSettings
 from clrecon.reading.grids.write_volume import write_volume
+from clrecon.viewer.model.model import ViewModel
+from clrecon.viewer.model.objects import show_objects
+from clrecon.viewer.model.saved_view import encode_view
 from clrecon.viewer.web.server import WebServer
 from clrecon.viewer.web.start_page import Limits, StartRoom
 
@@ -264,13 +271,98 @@ def test_choice_that_there_is_not_is_refused(large_dropper: Dropper, choice: str
     assert status == 422
 
 
+# Saved views that wait for their scan
+
+
+@pytest.fixture
+def saved_view(tmp_path: Path) -> Path:
+    """A view of the scan of `scenes` at 321 HU."""
+    model = ViewModel(show_objects([scenes.make_scan()]))
+    model.set_iso(321.0)
+    path = tmp_path / "shown.view.json"
+    path.write_bytes(encode_view(model.state, model.objects))
+    return path
+
+
+@pytest.fixture
+def scan(tmp_path: Path) -> Path:
+    write_volume(scenes.make_scan(), tmp_path / "scan.nii.gz")
+    return tmp_path / "scan.nii.gz"
+
+
+@pytest.fixture
+def waiting_dropper(open_room, saved_view: Path, device: Any) -> Iterator[Dropper]:
+    """A browser at the start page of a server at which a saved view waits."""
+    room = open_room(settings=ViewSettings(scan=MeshSettings(device=device.index), state=str(saved_view)))
+    with serving(room.open_session, start=room) as server:
+        yield Dropper(server, room)
+
+
+def shown_iso(server: WebServer) -> float:
+    """The iso value, HU, that a browser is told by its socket."""
+
+    async def browse() -> float:
+        async with browsing(server) as client:
+            await client.until(lambda: client.facts)
+            return float(client.facts["iso"]["hu"])
+
+    return asyncio.run(browse())
+
+
+@pytest.mark.opencl
+def test_saved_view_that_waits_is_shown_of_the_scan_that_is_dropped(waiting_dropper: Dropper, scan: Path) -> None:
+    query = f"secret={secret_of(waiting_dropper.server)}"
+    words = json.loads(get_path(waiting_dropper.server, f"/start/progress?{query}")[2])["waiting"]
+    waiting_dropper.drop(scan)
+
+    assert waiting_dropper.ask("open", choice=0) == (200, {})
+
+    assert "22 slices of 44 x 40" in words  # scenes.SHAPE
+    assert shown_iso(waiting_dropper.server) == 321.0
+
+
+@pytest.mark.opencl
+def test_scan_to_which_the_waiting_view_does_not_belong_is_refused_and_opens_without_it(
+    waiting_dropper: Dropper, tmp_path: Path
+) -> None:
+    write_series(tmp_path / "CT", Plan(shape=(7, 30, 40)))
+    waiting_dropper.drop(tmp_path / "CT")
+
+    status, told = waiting_dropper.ask("open", choice=0)
+    waiting_dropper.ask("forget")
+
+    assert status == 422
+    assert "22 slices of 44 x 40" in told["error"] and "7 slices of 40 x 30" in told["error"]
+    assert waiting_dropper.ask("open", choice=0) == (200, {})
+
+
+@pytest.mark.opencl
+def test_saved_view_that_is_dropped_alone_waits_for_the_scan_of_the_next_drop(
+    open_room, device: Any, saved_view: Path, scan: Path
+) -> None:
+    room = open_room(settings=ViewSettings(scan=MeshSettings(device=device.index)))
+    with serving(room.open_session, start=room) as server:
+        dropper = Dropper(server, room)
+        assert dropper.drop(saved_view) == []
+        dropper.drop(scan)
+        assert dropper.ask("open", choice=0) == (200, {})
+
+        assert shown_iso(server) == 321.0
+
+
+def test_saved_view_of_two_inputs_is_refused_at_the_start_with_their_kinds(open_room, tmp_path: Path) -> None:
+    model = ViewModel(show_objects([scenes.make_scan(), scenes.make_mesh()]))
+    (tmp_path / "two.view.json").write_bytes(encode_view(model.state, model.objects))
+
+    with refused(UsageError, "scan", "mesh"):
+        open_room(settings=ViewSettings(state=str(tmp_path / "two.view.json")))
+
+
 @pytest.mark.slow
 @pytest.mark.opencl
 def test_file_that_is_chosen_on_the_page_is_listed_opened_and_another_one_after_it(
     view_browser, device, open_room, tmp_path: Path
 ) -> None:
-    from clrecon.jobs.mesh.settings import MeshSettings
-
     write_volume(scenes.make_scan(), tmp_path / "scan.nii.gz")
     room = open_room(settings=ViewSettings(scan=MeshSettings(device=device.index)))
     with serving(room.open_session, start=room) as server:
