@@ -327,7 +327,8 @@ def test_command_without_a_driver_is_refused_in_one_line_that_says_how_to_get_on
     extra = [str(tmp_path), "-o", str(tmp_path / "a.stl")] if command == "mesh" else []
     assert main([command, *extra]) == 5
     captured = capsys.readouterr()
-    assert captured.err.startswith("clrecon: error: no OpenCL device found: install ")
+    assert captured.err.startswith("clrecon: error: no OpenCL device found")
+    assert ": install " in captured.err  # behind the limit of the process's memory, where there is one
     assert len(captured.err.splitlines()) == 1
     assert ("Clover  0 devices  OpenCL 1.1" in captured.out) == (command == "devices")
     assert list(tmp_path.iterdir()) == []
