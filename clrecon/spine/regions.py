@@ -9,12 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.geometry.affine import Float64Array
-from clrecon.geometry.regions import FACES, IN_SLICE, Regions
+from clrecon.geometry.regions import FACES, IN_SLICE, Regions, number_connected
 from clrecon.geometry.volume import Volume
 from clrecon.spine.discs import AHEAD_MM, ASIDE_MM, BODY_BACK_MM, TILTS_DEG, Bound, Course, Field, Looks
 from clrecon.system.light_dataclass import dataclass
@@ -62,6 +63,8 @@ _RIDGE_WIDTH = 0.12
 _RIDGE_AHEAD_MM = (-25.0, 4.0)
 _RIDGE_MM, _RIDGE_HU = 1.5, 125.0
 """What a ridge between two arches adds to a landscape at its crest."""
+_LEVEL_MM, _LEVEL_HU = 0.02, 1.0
+"""Steps of the landscapes."""
 _ARCH_DOWN = 0.3
 """An arch lies so much lower than its body, in gaps of the discs."""
 
@@ -201,16 +204,15 @@ def divide(
     those partial volume makes the place uncertain.
     """
     from scipy.ndimage import distance_transform_edt, gaussian_filter
-    from skimage.segmentation import watershed
 
     ribs = _find_ribs(part, bone)
     bone = bone & (np.abs(part.aside) <= BESIDE_MM)
     markers = _mark_bodies(part, bone, planes, volume)
     ridge = _ridges(part, bounds)
     depth = distance_transform_edt(bone, sampling=part.spacing)
-    by_depth = watershed(_RIDGE_MM * ridge - depth, markers, mask=bone)
+    by_depth = flood(_RIDGE_MM * ridge - depth, _LEVEL_MM, markers, bone)
     bright = gaussian_filter(np.clip(part.values, 0.0, _BRIGHT_HU), [_BRIGHT_MM / step for step in part.spacing])
-    by_brightness = watershed(_RIDGE_HU * ridge - bright, markers, mask=bone)
+    by_brightness = flood(_RIDGE_HU * ridge - bright, _LEVEL_HU, markers, bone)
     pieces = _bound(part, _settle(part, by_depth, by_brightness, bounds), bounds, planes, volume)
     pieces[ribs] = 0
     pieces[~_peel(part, pieces > 0)] = 0
@@ -219,6 +221,41 @@ def divide(
         for chosen in (pieces >= 0, by_depth != by_brightness, _find_rim(pieces))
     )
     return pieces, differ / np.maximum(count, 1), rim / np.maximum(count, 1)
+
+
+def flood(landscape: NDArray[Any], step: float, markers: NDArray[np.int32], mask: Mask) -> NDArray[np.int32]:
+    """Return the watershed of a landscape from markers, over faces of voxels in a mask; `step`: height of a level.
+
+    Level by level from the lowest, each voxel that a basin has reached gives its number to those beside it.
+    """
+    numbers = np.pad(np.where(mask, markers, -1), 1, constant_values=-1)
+    _, nj, ni = numbers.shape
+    flat, levels = numbers.reshape(-1), np.zeros(numbers.size, np.int16)
+    places = np.flatnonzero(flat >= 0)
+    levels[places] = heights = ((landscape[mask] - landscape[mask].min(initial=0.0)) / step).astype(np.int16)
+    by_height = places[np.argsort(heights, kind="stable")]
+    for level, at_level in enumerate(np.split(by_height, np.cumsum(np.bincount(heights)))):
+        ready = at_level[flat[at_level] > 0]
+        while len(ready):
+            reached = []
+            for offset in (1, -1, ni, -ni, ni * nj, -ni * nj):
+                free = ready[flat[ready + offset] == 0] + offset
+                flat[free] = flat[free - offset]
+                reached.append(free)
+            ready = np.concatenate(reached)
+            ready = ready[levels[ready] <= level]
+    return np.maximum(numbers[1:-1, 1:-1, 1:-1], 0)
+
+
+def number_groups(kinds: NDArray[np.int32]) -> NDArray[np.signedinteger[Any]]:
+    """Number the groups of voxels of one kind that faces connect, from 1; return the numbers of those of a kind > 0."""
+    nodes = np.cumsum(kinds > 0).reshape(kinds.shape) - 1
+    pairs = []
+    for axis in range(3):
+        kind, node = np.moveaxis(kinds, axis, 0), np.moveaxis(nodes, axis, 0)
+        alike = (kind[1:] == kind[:-1]) & (kind[1:] > 0)
+        pairs.append(np.stack([node[1:][alike], node[:-1][alike]]))
+    return number_connected(int(np.count_nonzero(kinds)), *np.concatenate(pairs, axis=1))
 
 
 def _find_rim(pieces: NDArray[np.uint8]) -> Mask:
@@ -303,14 +340,12 @@ def _settle(
     part: Part, by_depth: NDArray[np.int32], by_brightness: NDArray[np.int32], bounds: list[Bound]
 ) -> NDArray[np.uint8]:
     """Choose one of two divisions for each group of voxels in which they differ."""
-    from skimage.measure import label
-
     cuts = np.array([bound.at for bound in bounds], np.float64)
     gaps = np.diff(cuts) if len(cuts) > 1 else np.array([30.0])
     upper, lower = np.r_[cuts[0] - gaps[0], cuts], np.r_[cuts, cuts[-1] + gaps[-1]]
     differ = by_depth != by_brightness
     pairs = np.where(differ, by_depth * (len(bounds) + 2) + by_brightness, 0)
-    groups = label(pairs, connectivity=1)[differ]
+    groups = number_groups(pairs)
     if not len(groups):
         return by_brightness.astype(np.uint8)
     count = np.maximum(np.bincount(groups), 1)

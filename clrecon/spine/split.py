@@ -40,7 +40,6 @@ from clrecon.spine.regions import CONFIDENT, Piece, beside_share, cut_part, divi
 from clrecon.system.arguments import explains_arguments, name_parameter
 from clrecon.system.base_classes import Message
 from clrecon.system.light_dataclass import dataclass
-from clrecon.system.packages import import_package
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.records import Record
 from clrecon.system.text import count_of
@@ -287,7 +286,6 @@ def split_vertebrae(
 
 
 def _check_input(volume: Volume, level: float | None) -> None:
-    import_package("skimage.segmentation", "finding vertebrae")
     if level is not None and not math.isfinite(level):
         raise UsageError(f"the level of bone is a number of HU, not {level!r}")
     if volume.uneven:

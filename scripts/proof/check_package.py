@@ -44,6 +44,7 @@ SMALL_COMMANDS = (
     "distance bone.stl cortex.vtp --picture distance.png",
     "inside scan --labels scan/levels.nrrd --label L3 -o inside.ply",
     "corridor scan --labels scan/levels.nrrd --label L3",
+    "vertebrae scan -o spine.nii.gz",
     "export scan -o scan.nii.gz",
     "view scan --html page.html",
 )

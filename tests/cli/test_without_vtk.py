@@ -120,7 +120,7 @@ def test_command_that_neither_fits_nor_smooths_runs_without_scipy(device: Any, c
     ("command", "package"),
     [
         ("mesh ct -o a.stl --smooth", "scipy"),
-        ("vertebrae ct -o a.nii.gz", "scikit-image"),
+        ("vertebrae ct -o a.nii.gz", "scipy"),
         ("mesh ct -o a.stl --method skimage", "scikit-image"),
     ],
 )

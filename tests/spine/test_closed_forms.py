@@ -171,3 +171,18 @@ def test_the_bias_is_measured_along_rays_all_round_evenly_spaced_stations_of_the
     stations = START + np.linspace(0.0, 10.0, measures.STATIONS)[:, None] * ALONG
     middles = points_on_rays.mean(axis=1)  # of all rays, at each of their steps
     np.testing.assert_allclose(middles, np.broadcast_to(stations[:, None], middles.shape), atol=1e-9)
+
+
+def test_watershed_of_a_landscape_without_ties_is_that_of_scikit_image() -> None:
+    watershed = pytest.importorskip("skimage.segmentation").watershed
+    random = np.random.default_rng(4)
+    landscape = random.permutation(11 * 12 * 13).reshape(11, 12, 13)
+    mask = random.random(landscape.shape) < 0.8
+    markers = np.where(random.random(landscape.shape) < 0.01, random.integers(1, 4, landscape.shape), 0) * mask
+
+    assert np.array_equal(regions.flood(landscape, 1.0, markers, mask), watershed(landscape, markers, mask=mask))
+
+
+def test_groups_of_one_kind_are_numbered_apart_where_only_corners_or_other_kinds_join_them() -> None:
+    kinds = np.array([[[2, 2, 5, 0], [0, 0, 5, 2]], [[5, 0, 5, 0], [0, 0, 0, 2]]])
+    assert regions.number_groups(kinds).tolist() == [1, 1, 2, 2, 3, 4, 2, 3]  # of the kinds above 0, in their order

@@ -84,7 +84,7 @@ INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
     # vtkmodules: peers of the bench and of the comparison, whose page has plots and pictures.
     "proof": frozenset({"scipy", "pyvista", "skimage", "vtkmodules", "matplotlib", "PIL"}),
     "cli": frozenset({"rich"}),
-    "spine": frozenset({"scipy", "skimage"}),
+    "spine": frozenset({"scipy"}),
 }
 
 
