@@ -140,13 +140,24 @@ def test_saved_view_among_the_inputs_is_that_of_the_others(
 
 
 @pytest.mark.opencl
-def test_view_of_a_scan_begins_with_bone_without_the_table_and_says_what_was_taken(device: Any, scan: Path) -> None:
-    with open_scan(scan, device) as view, view.session() as session:
+def test_view_of_a_scan_begins_with_bone_without_the_table_and_says_what_was_taken(device: Any, tmp_path: Path) -> None:
+    _, j, i = np.indices((24, 64, 64)) - 32
+    radius = np.hypot(i, j)
+    voxels = np.select([radius < 5, radius < 20, (abs(j - 26) < 2) & (abs(i) < 24)], [700, 40, 300], -1000)
+    clrecon.write_volume(Volume(voxels.astype(np.int16), np.diag([2.0, 2.0, 2.0, 1.0])), tmp_path / "table.nii.gz")
+
+    with open_scan(tmp_path / "table.nii.gz", device) as view, view.session() as session:
         facts = session.do({"do": "undo"})
 
         assert (session.model.state.mode, session.model.state.table) == ("bone", False)
-        assert "table and blankets taken away" in facts["said"]
+        assert "27 ml of table and blankets taken away" in facts["said"]  # 24 x 3 x 47 voxels of 8 cubic mm
         assert facts["undone"] is None  # the table and the mode of the start are no step
+
+
+@pytest.mark.opencl
+def test_view_of_a_scan_without_a_table_says_nothing_of_one(device: Any, scan: Path) -> None:
+    with open_scan(scan, device) as view, view.session() as session:
+        assert session.facts()["said"] is None
 
 
 @pytest.mark.opencl

@@ -316,11 +316,13 @@ class ViewSession(Closing):
             self.model.begin_with_bone(bare=bare)
             self._said = self._say_table() if bare else None
 
-    def _say_table(self) -> str:
-        """Return what was taken away with the tables, and the way back."""
+    def _say_table(self) -> str | None:
+        """Return what was taken away with the tables, and the way back; None: next to nothing."""
         facts = self.painter.remove_table()
         removed = [(facts[scan.number]["dense_voxels_removed"], scan.volume.spacing) for scan in self.model.scans]
         ml = sum(voxels * math.prod(spacing) / 1000.0 for voxels, spacing in removed)
+        if ml < 0.5:
+            return None
         return f"{ml:,.0f} ml of table and blankets taken away: look whether the body is whole (b: show them)"
 
     def toggle_table(self) -> None:
@@ -329,7 +331,7 @@ class ViewSession(Closing):
     def _apply_table(self, shown: bool) -> None:
         self.model.set_table(shown)
         if not shown:
-            self._said = self._say_table()
+            self._said = self._say_table() or "there is no table to take away, and no blankets"
         self.rest()
 
     def set_fitted(self, shown: bool) -> None:

@@ -61,6 +61,11 @@
   }));
   const phone = matchMedia("(max-width: 640px)");  // one view at a time, chosen by its tab
   phone.onchange = () => { full = ""; layOut(); };
+  const narrow = matchMedia("(max-width: 900px)");  // of the panel one section at a time, none at first
+  const fold = () => { for (const section of document.querySelectorAll("details")) Object.assign(section, { open: !narrow.matches, name: narrow.matches ? "sheet" : "" }); };
+  narrow.onchange = fold;
+  find("iso").ontoggle = () => { if (facts && facts.iso) showIso(); };  // as many marks as there is room for
+  fold();
   const isShown = (view) => !view.box.hidden && view.box.clientWidth > 0;
 
   // One view takes the place of all, or gives it back.
@@ -298,7 +303,7 @@
       if (held === input || document.activeElement === find("exact") && id === "exact") continue;
       Object.assign(input, { min: Math.ceil(facts.iso.low), max: Math.floor(facts.iso.high), value: Math.round(facts.iso.hu) });
     }
-    const { low, high } = facts.iso, step = roundLength((high - low) / Math.max(1, find("marks").clientWidth / 60)), marks = [];
+    const { low, high } = facts.iso, step = roundLength(2.5 * (high - low) / Math.max(1, find("marks").clientWidth / 38)), marks = [];
     for (let hu = Math.ceil(low / step) * step; hu <= high; hu += step) marks.push(hu);
     find("marks").replaceChildren(...marks.map((hu) => {
       const mark = element("span", String(hu).replace("-", "\u2212"));

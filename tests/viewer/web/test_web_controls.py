@@ -200,6 +200,45 @@ def test_phone_shows_the_view_of_a_tab_alone(phone) -> None:
     )
 
 
+def test_panel_of_a_phone_shows_one_section_at_a_time_over_the_view(phone) -> None:
+    opened = "return [...document.querySelectorAll('details[open] summary')].map((summary) => summary.textContent)"
+    assert phone.execute_script(opened) == []
+
+    for name in ("Surface", "Parts"):
+        phone.find_element("xpath", f"//summary[text()='{name}']").click()
+        wait_for(
+            phone, f"return document.querySelectorAll('details[open]').length === 1 && ({opened[7:]})[0] === '{name}'"
+        )
+        box = phone.find_element("css selector", "details[open] > div").rect
+        assert (box["x"], box["width"]) == (0, 400)
+
+    phone.find_element("xpath", "//summary[text()='Parts']").click()
+    wait_for(phone, "return !document.querySelector('details[open]')")
+
+
+SIZES = {"wide": (1100, 250, 230), "tablet": (900, 290, 240), "small tablet": (700, 230, 240)}
+"""Width of the window, and least width and height of a slice, pixels: a third of the narrow ones, as wide as high."""
+
+
+@pytest.mark.parametrize(("width", "least_wide", "least_high"), SIZES.values(), ids=SIZES)
+def test_slices_of_a_window_between_phone_and_desktop_are_large_enough_to_read(
+    page, width: int, least_wide: int, least_high: int
+) -> None:
+    page.execute_script("clrecon.run('set_layout', { name: '1+3' })")
+    size = {"width": width, "height": 800, "deviceScaleFactor": 1, "mobile": False}
+    page.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    try:
+        wait_for(page, f"return innerWidth === {width} && clrecon.facts.layout === '1+3'")
+        sizes = page.execute_script(
+            "return [axial, coronal, sagittal].map((box) => [box.clientWidth, box.clientHeight])"
+        )
+    finally:
+        page.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+        wait_for(page, f"return innerWidth !== {width}")
+
+    assert all(wide >= least_wide and high >= least_high for wide, high in sizes), sizes
+
+
 def test_wide_window_shows_all_views_again(phone) -> None:
     phone.execute_script("clrecon.run('set_layout', { name: '1+3' })")
     wait_for(phone, "return clrecon.facts.layout === '1+3'")
