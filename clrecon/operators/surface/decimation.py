@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -18,7 +17,7 @@ from clrecon.operators.masks.voxel_mask import zero_words
 from clrecon.operators.surface.collapse import DeviceCollapser
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.light_dataclass import dataclass
-from clrecon.system.pieces import find_bounds
+from clrecon.system.pieces import chunks, find_bounds, in_threads
 from clrecon.system.progress import Progress, Steps
 
 _FEWEST = 20_000
@@ -41,7 +40,13 @@ _MOST_LANES = 8
 """Entries that the kernel looks at together."""
 
 _PIECE = 1 << 17
-"""Triangles of a launch; progress is reported between launches."""
+"""Most entries of a launch."""
+
+_PART = 1 << 19
+"""Triangles that are entered at once, while the device looks at those before; progress is reported after each."""
+
+_LOOKED_AT = 1 << 16
+"""About as many triangles tell how large boxes are."""
 
 Float32Array = NDArray[np.float32]
 IntArray = NDArray[np.integer]
@@ -70,27 +75,43 @@ class RowGrid:
 
 @dataclass(frozen=True)
 class CrossingPlan:
-    """Triangles in all rows that their boxes touch, as the kernel reads them.
+    """Triangles, and the rows that their boxes touch.
 
     vertices: ndarray, shape (v, 3), float32. Scaled by two to the power of `exponent`, which changes no digit.
     triangles: ndarray, shape (n, 3), uint32
-    order, rows: ndarray, shape (e,), uint32. Triangle and row of each entry, those of a row by their lowest x.
+    numbers: ndarray, shape (m,), uint32. Those of them that are entered.
+    steps: ndarray, shape (m,), uint16. Lowest step of x of each.
+    rows: ndarray, shape (3, m), int32. First row of each, and how many rows along y and z it touches.
     """
 
     vertices: Float32Array
     exponent: int
     triangles: NDArray[np.uint32]
     grid: RowGrid
-    order: NDArray[np.uint32]
-    rows: NDArray[np.uint32]
+    numbers: NDArray[np.uint32]
+    steps: NDArray[np.uint16]
+    rows: NDArray[np.int32]
+
+    @property
+    def entries(self) -> int:
+        """Number of entries: of each triangle one for each row."""
+        return int(np.sum(self.rows[1] * self.rows[2], dtype=np.int64))
 
     @property
     def stride(self) -> int:
-        return len(self.order) + _MOST_LANES
+        return self.entries + _MOST_LANES
 
     def needs(self) -> dict[str, int]:
-        given = self.vertices.nbytes + self.triangles.nbytes + 2 * self.order.nbytes
+        given = self.vertices.nbytes + self.triangles.nbytes + 8 * self.entries
         return {"triangles in rows": given + _ENTRY_BYTES * self.stride, "marks": self.stride // 8}
+
+    def enter(self, part: slice) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
+        """Return triangle and row of each entry of a part of the triangles: those of a row by their lowest x."""
+        by_x = np.argsort(self.steps[part], kind="stable")
+        first, wide, deep = self.rows[:, part].take(by_x, axis=1)
+        rows = list_runs(list_runs(first, deep, np.int32(self.grid.last[1] + 1.0)), wide.repeat(deep))
+        order = order_by_number(rows, self.grid.rows)
+        return self.numbers[part].take(by_x).repeat(wide * deep).take(order), rows.take(order).astype(np.uint32)
 
 
 def plan_crossings(
@@ -98,8 +119,8 @@ def plan_crossings(
 ) -> CrossingPlan:
     """Enter at least one triangle into rows; those of `rows` alone where they are given."""
     exponent = 11 - int(np.frexp(np.abs(vertices).max())[1])
-    scaled, entered = np.ldexp(vertices, exponent), triangles if rows is None else triangles[rows]
-    low, high = find_boxes(scaled, entered)
+    scaled, numbers = np.ldexp(vertices, exponent), np.arange(len(triangles)) if rows is None else rows
+    low, high = find_boxes(scaled, triangles[numbers[:: max(len(numbers) // _LOOKED_AT, 1)]])
     across, deep = (high[:, axis] - low[:, axis] for axis in (1, 2))
     # Of rows so wide a box of these sides touches (1 + across / edge) * (1 + deep / edge), on average.
     both, square = (float(np.mean(terms, dtype=np.float64)) / _MORE_ENTRIES for terms in (across + deep, across * deep))
@@ -111,22 +132,23 @@ def plan_crossings(
         if grid.rows <= most_rows:
             break
         edge *= 1.25
-    plan = _enter_into_rows(scaled, exponent, entered, grid, low, high)
-    return plan if rows is None else replace(plan, triangles=triangles, order=rows.astype(np.uint32)[plan.order])
+    return _plan_rows(scaled, exponent, triangles, grid, numbers.astype(np.uint32))
 
 
-def _enter_into_rows(
-    scaled: Float32Array, exponent: int, triangles: NDArray[np.uint32], grid: RowGrid, *boxes: Float32Array
+def _plan_rows(
+    scaled: Float32Array, exponent: int, triangles: NDArray[np.uint32], grid: RowGrid, numbers: NDArray[np.uint32]
 ) -> CrossingPlan:
-    by_x = np.argsort(grid.steps(boxes[0][:, 0], 0).astype(np.uint16), kind="stable")
-    (first_y, first_z), (last_y, last_z) = ([grid.steps(corner[:, n], n) for n in (1, 2)] for corner in boxes)
     along_y = np.int32(grid.last[1] + 1.0)
-    of_triangles = (first_y + along_y * first_z, last_y - first_y + 1, last_z - first_z + 1)
-    first, wide, deep = (numbers.take(by_x) for numbers in of_triangles)
-    rows = list_runs(list_runs(first, deep, along_y), wide.repeat(deep))
-    order = order_by_number(rows, grid.rows)
-    entries = by_x.astype(np.uint32).repeat(wide * deep).take(order)
-    return CrossingPlan(scaled, exponent, triangles, grid, entries, rows.take(order).astype(np.uint32))
+    steps, rows = np.empty(len(numbers), np.uint16), np.empty((3, len(numbers)), np.int32)
+
+    def find_rows(piece: slice) -> None:
+        low, high = find_boxes(scaled, triangles[numbers[piece]])
+        steps[piece] = grid.steps(low[:, 0], 0)
+        (first_y, first_z), (last_y, last_z) = ([grid.steps(corner[:, n], n) for n in (1, 2)] for corner in (low, high))
+        rows[:, piece] = first_y + along_y * first_z, last_y - first_y + 1, last_z - first_z + 1
+
+    in_threads(find_rows, len(numbers))
+    return CrossingPlan(scaled, exponent, triangles, grid, numbers, steps, rows)
 
 
 class CrossingMarks:
@@ -150,55 +172,52 @@ class CrossingMarks:
         self._grid_d = ocl.upload(self._device, np.concatenate([grid.origin, grid.per_step, grid.last]))
         self._reaches_d = zero_words(self._device, grid.rows)
 
-    def look(self, *, piece: int = _PIECE, steps: Steps | None = None) -> tuple[IntArray, IntArray]:
+    def look(self, *, part: int = _PART, steps: Steps | None = None) -> tuple[IntArray, IntArray]:
         """Return the triangles of the plan that may cut another one, or have no area, and those that surely cut one."""
-        return self._mark(self._plan, self._plan.order, piece=piece, steps=steps)
+        return self._mark(self._plan, part, steps)
 
     def look_again(self, vertices: Float32Array, changed: IntArray) -> tuple[IntArray, IntArray]:
         """Return the same of triangles that have changed, and what they may cut; of all where there is no room left."""
-        plan, triangles = self._plan, self._plan.triangles[changed]
-        used = find_used(triangles, len(vertices))
+        plan = self._plan
+        used = find_used(plan.triangles[changed], len(vertices))
         plan.vertices[used] = np.ldexp(vertices[used], plan.exponent)
-        boxes = find_boxes(plan.vertices, triangles)
-        again = _enter_into_rows(plan.vertices, plan.exponent, triangles, plan.grid, *boxes)
+        again = _plan_rows(plan.vertices, plan.exponent, plan.triangles, plan.grid, changed.astype(np.uint32))
         if len(self._triangles) + again.stride > self._stride:
             rows = find_used(np.concatenate([self._triangles, changed]), len(plan.triangles))
             self._forget(plan_crossings(vertices, plan.triangles, rows))
             return self.look()
-        return self._mark(again, changed.astype(np.uint32)[again.order])
+        return self._mark(again)
 
-    def _mark(
-        self, plan: CrossingPlan, triangles: NDArray[np.uint32], *, piece: int = _PIECE, steps: Steps | None = None
-    ) -> tuple[IntArray, IntArray]:
+    def _mark(self, plan: CrossingPlan, part: int = _PART, steps: Steps | None = None) -> tuple[IntArray, IntArray]:
         device, rows = self._device, plan.grid.rows
-        first, older = len(self._triangles), len(self._starts) // (rows + 1)
-        ends = first + np.cumsum(np.bincount(plan.rows, minlength=rows))
-        starts_d = ocl.upload(device, np.append(self._starts, np.uint32(first)))
-        self._starts = np.concatenate([self._starts, [first], ends]).astype(np.uint32)
-        self._triangles = np.concatenate([self._triangles, triangles])
         marks = np.empty((2, (self._stride + 31) // 32), np.uint32)
         marks_d = zero_words(device, marks.size)
         shared = {
             "vertices": ocl.upload(device, plan.vertices), "places": self._places_d, "names": self._names_d,
             "marks": marks_d, "grid": self._grid_d, "reaches": self._reaches_d, "stride": self._stride,
         }  # fmt: skip
-        ocl.launch(
-            device, self._program["enter_triangles"], plan.stride, triangles=ocl.upload(device, plan.triangles),
-            order=ocl.upload(device, plan.order), rows=ocl.upload(device, plan.rows), **shared, first=first,
-            items=plan.stride, count=len(triangles),
-        )  # fmt: skip
-        for begin in range(first, len(self._triangles), piece):
-            items = min(piece, len(self._triangles) - begin)
+        triangles_d = ocl.upload(device, plan.triangles)
+        for span in chunks(len(plan.numbers), part):  # the device looks at one part while the next is entered
+            order, row_of_each = plan.enter(span)
+            first, count = len(self._triangles), len(order)
+            ends = first + np.cumsum(np.bincount(row_of_each, minlength=rows))
+            starts_d = ocl.upload(device, np.append(self._starts, np.uint32(first)))
+            self._starts = np.concatenate([self._starts, [first], ends]).astype(np.uint32)
+            self._triangles = np.concatenate([self._triangles, order])
             ocl.launch(
-                device, self._program["mark_crossings"], items, **shared, starts=starts_d, first=begin, items=items,
-                older=older,
+                device, self._program["enter_triangles"], count + _MOST_LANES, triangles=triangles_d,
+                order=ocl.upload(device, order), rows=ocl.upload(device, row_of_each), **shared, first=first,
+                items=count + _MOST_LANES, count=count,
+            )  # fmt: skip
+            ocl.launch(
+                device, self._program["mark_crossings"], count, _PIECE, **shared, starts=starts_d, first=first,
+                items=count, older=len(self._starts) // (rows + 1) - 1,
             )  # fmt: skip
             if steps is not None:
                 ocl.wait(device)
-                done = (begin + np.array([0, items])) * len(plan.triangles) // len(triangles)
-                steps.take(int(done[1] - done[0]))
+                steps.take(span.stop - span.start)
         bits = np.unpackbits(ocl.download(device, marks, marks_d).view(np.uint8), axis=1, bitorder="little")
-        unsure, cut = (find_used(self._triangles[np.flatnonzero(row)], len(self._plan.triangles)) for row in bits)
+        unsure, cut = (find_used(self._triangles[np.flatnonzero(row)], len(plan.triangles)) for row in bits)
         return unsure, cut
 
 

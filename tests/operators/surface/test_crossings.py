@@ -63,14 +63,16 @@ def test_triangles_are_entered_in_the_rows_that_their_boxes_touch():
         for y in range(low[row], high[row] + 1)
     }
     assert len(expected) > 800  # measured 898
-    assert set(zip(plan.order.tolist(), plan.rows.tolist(), strict=True)) == expected
-    assert len(plan.order) == len(expected)
+    order, rows = plan.enter(slice(None))
+    assert set(zip(order.tolist(), rows.tolist(), strict=True)) == expected
+    assert len(order) == plan.entries == len(expected)
 
 
 def test_entries_of_a_row_lie_in_the_order_of_their_lowest_x():
     plan = plan_crossings(*scattered(700, sizes=MANY_SMALL_TRIANGLES), most_rows=100)
-    steps = plan.grid.steps(plan.vertices[plan.triangles].min(axis=1)[:, 0], 0)[plan.order]
-    keys = plan.rows.astype(np.int64) * (int(plan.grid.last[0]) + 1) + steps
+    order, rows = plan.enter(slice(None))
+    steps = plan.grid.steps(plan.vertices[plan.triangles].min(axis=1)[:, 0], 0)[order]
+    keys = rows.astype(np.int64) * (int(plan.grid.last[0]) + 1) + steps
     assert (np.diff(keys) >= 0).all()
 
 
@@ -81,7 +83,7 @@ def test_there_are_no_more_rows_than_allowed_and_more_than_half_of_them():
 
 def test_long_triangles_among_short_ones_make_rows_wide_enough_for_few_entries():
     plan = plan_crossings(*scattered(700, sizes=(0.1, 0.1, 0.1, 20.0)))
-    assert 1.2 * 700 < len(plan.order) < 1.8 * 700  # 1.5 where places are random
+    assert 1.2 * 700 < plan.entries < 1.8 * 700  # 1.5 where places are random
 
 
 @pytest.mark.every_device
@@ -244,13 +246,16 @@ def test_triangles_that_the_device_does_not_take_have_the_crossings_of_the_host(
     assert told[-1] == ("crossings", 600, 600)
 
 
-def test_progress_of_crossings_is_told_after_each_piece(device):
+def test_progress_of_crossings_is_told_after_each_part(device):
     told: list[int] = []
-    plan = plan_crossings(*scattered(600))
-    steps = Steps(lambda *step: told.append(step[1]), "crossings", 600)
-    CrossingMarks(device, plan).look(piece=256, steps=steps)
-    shares = np.minimum(np.arange(0, len(plan.order) + 256, 256) / len(plan.order), 1.0)
-    assert told == np.floor(600 * shares).astype(int).tolist()
+    marked(device, *scattered(600), part=256, steps=Steps(lambda *step: told.append(step[1]), "crossings", 600))
+    assert told == [0, 256, 512, 600]
+
+
+@pytest.mark.every_device
+def test_triangles_entered_in_parts_have_the_marks_of_all_at_once(device):
+    vertices, triangles = scattered(900)
+    assert np.array_equal(marked(device, vertices, triangles, part=128), marked(device, vertices, triangles))
 
 
 def test_progress_of_crossings_may_end_the_work(device):
@@ -259,7 +264,7 @@ def test_progress_of_crossings_may_end_the_work(device):
             raise Cancelled("enough")
 
     with pytest.raises(Cancelled, match="enough"):
-        marked(device, *scattered(600), piece=256, steps=Steps(cancel, "crossings", 600))
+        marked(device, *scattered(600), part=256, steps=Steps(cancel, "crossings", 600))
 
 
 def test_progress_of_crossings_counts_all_triangles_of_one_piece_at_once(device):
