@@ -17,7 +17,7 @@ from clrecon.jobs.run import to_json
 from clrecon.mesh import Mesh
 from clrecon.mesh.compare.distances import SurfaceDistance, compare_meshes, summarise_distances
 from clrecon.proof.compare.mesh_cells import GridCells, find_mesh_cells, measure_cells
-from clrecon.proof.compare.mesh_slices import measure_slices
+from clrecon.proof.compare.mesh_slices import ScanSlices
 from clrecon.proof.compare.mesh_truth import REACH_MM, measure_truth
 from clrecon.proof.compare.processes import load_array, load_mesh, load_volume
 from clrecon.proof.phantom import phantom_truth
@@ -38,9 +38,9 @@ class Judge:
     def __init__(self, message: Mapping[str, Any]):
         self._folder = Path(message["folder"])
         self._reference: str | None = message["reference"]
-        self._level, self._closed = float(message["iso_value"]), bool(message["closed"])
         self._truth = message["truth"]
         self._volume = load_volume(self._folder)
+        self._slices = ScanSlices(self._volume, float(message["iso_value"]), bool(message["closed"]))
 
     @cached_property
     def truth(self) -> Any:
@@ -75,7 +75,7 @@ class Judge:
         reference, volume = self.reference, self._volume
         takers: dict[str, Callable[[], Any]] = {
             "quality": lambda: _facts_of_quality(mesh),
-            "slices": lambda: measure_slices(mesh, volume, self._level, closed=self._closed),
+            "slices": lambda: self._slices.measure(mesh),
         }
         if reference is not None:
             takers["cells"] = lambda: measure_cells(mesh, self.cells, volume, reference_name=self._reference)

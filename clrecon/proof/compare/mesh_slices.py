@@ -90,7 +90,7 @@ def measure_slices(
     offsets : three floats
         Where the lattice begins, in its own steps along i, j, k, from 0 to below 1.
     progress : callable, optional
-        Called as ``progress("slices", layers of cells done, all layers)``.
+        Called as ``progress("slices", layers of cells done, all layers)``, once for each lattice.
 
     Returns
     -------
@@ -104,36 +104,63 @@ def measure_slices(
     NoSurfaceError
         The mesh is empty.
     """
-    mesh.check()
-    if mesh.triangle_count == 0:
-        raise NoSurfaceError("a mesh without triangles has no slices")
-    shifts = _check_lattice(finer, offsets)
-    if np.ndim(iso_value):
-        raise UsageError(f"slices are compared at one iso value, not at {iso_value!r}")
-    rule = choose_iso_rule(volume, iso_value, closed=closed)
-    ijk = volume.lps_to_ijk(mesh.vertices)
-    _check_place(ijk, volume, rule)
-    report = progress or ignore_progress
-    lattices = (Lattice.over(volume, rule, int(finer), shifts), Lattice.over(volume, rule, 1, (0.0, 0.0, 0.0)))
-    layers = lattices[0].cells_ijk[2]
-    overlaps = []
-    for n, lattice in enumerate(lattices):
+    return ScanSlices(volume, iso_value, closed, finer, offsets).measure(mesh, progress or ignore_progress)
 
-        def tell_done(done: int, before: int = n * layers) -> None:
-            report("slices", before + done, 2 * layers)
 
-        overlaps.append(_count_overlap(ijk, mesh.triangles, volume, rule, lattice, tell_done))
-    fine, overlap = overlaps
-    report("slices", 2 * layers, 2 * layers)
-    return SliceOverlap(
-        dice=fine.dice,
-        voxel_dice=overlap.dice,
-        finer=int(finer),
-        points_mesh=fine.mesh,
-        points_hu=fine.hu,
-        points_common=fine.common,
-        rows_odd=fine.odd,
-    )
+class ScanSlices:
+    """The HU of a scan on the lattices of `measure_slices`, for several meshes."""
+
+    def __init__(
+        self, volume: Volume, iso_value: float, closed: bool, finer: int = FINER, offsets: Sequence[float] = OFFSETS
+    ):
+        shifts = _check_lattice(finer, offsets)
+        if np.ndim(iso_value):
+            raise UsageError(f"slices are compared at one iso value, not at {iso_value!r}")
+        self._volume, self._rule = volume, choose_iso_rule(volume, iso_value, closed=closed)
+        lattices = ((int(finer), shifts), (1, (0.0, 0.0, 0.0)))
+        self._lattices = [Lattice.over(volume, self._rule, *lattice) for lattice in lattices]
+        self._runs: dict[Lattice, Keys] = {}
+
+    def measure(self, mesh: Mesh, report: Progress = ignore_progress) -> SliceOverlap:
+        mesh.check()
+        if mesh.triangle_count == 0:
+            raise NoSurfaceError("a mesh without triangles has no slices")
+        ijk = self._volume.lps_to_ijk(mesh.vertices)
+        _check_place(ijk, self._volume, self._rule)
+        layers = self._lattices[0].cells_ijk[2]
+        overlaps = []
+        for n, lattice in enumerate(self._lattices):
+            report("slices", n * layers, 2 * layers)
+            overlaps.append(self._count_overlap(find_piercings(ijk, mesh.triangles, lattice), lattice))
+        fine, overlap = overlaps
+        report("slices", 2 * layers, 2 * layers)
+        return SliceOverlap(
+            dice=fine.dice,
+            voxel_dice=overlap.dice,
+            finer=self._lattices[0].finer,
+            points_mesh=fine.mesh,
+            points_hu=fine.hu,
+            points_common=fine.common,
+            rows_odd=fine.odd,
+        )
+
+    def _count_overlap(self, mesh: Keys, lattice: Lattice) -> _Counts:
+        """Count the points of a lattice that are in a mesh, by its piercings, in the HU, and in both."""
+        if lattice not in self._runs:
+            self._runs[lattice] = find_level_runs(self._volume, self._rule, lattice)
+        hu = self._runs[lattice]
+        rows, ends = np.unique(lattice.row_of(mesh), return_counts=True)
+        odd = rows[ends % 2 == 1]
+        if len(odd) > _MOST_ODD * len(rows):
+            raise UsageError(
+                f"the mesh is open: {len(odd)} of {len(rows)} rows through it pierce it an odd number of times, and"
+                " what lies inside is not defined; close it first"
+            )
+        if len(odd):
+            mesh, hu = (keys[~np.isin(lattice.row_of(keys), odd)] for keys in (mesh, hu))
+        inside, wanted = count_points(mesh), count_points(hu)
+        apart = count_points(exclusive_or(mesh, hu))
+        return _Counts(inside, wanted, (inside + wanted - apart) // 2, len(odd))
 
 
 def _check_lattice(finer: int, offsets: Sequence[float]) -> tuple[float, float, float]:
@@ -164,30 +191,6 @@ class _Counts:
     def dice(self) -> float:
         both = self.mesh + self.hu
         return 2.0 * self.common / both if both else 0.0
-
-
-def _count_overlap(
-    ijk: NDArray[np.float64],
-    triangles: NDArray[np.uint32],
-    volume: Volume,
-    rule: IsoRule,
-    lattice: Lattice,
-    report: Callable[[int], None],
-) -> _Counts:
-    """Count the points of a lattice that are in the mesh, in the HU, and in both."""
-    mesh, hu = find_piercings(ijk, triangles, lattice), find_level_runs(volume, rule, lattice, report)
-    rows, ends = np.unique(lattice.row_of(mesh), return_counts=True)
-    odd = rows[ends % 2 == 1]
-    if len(odd) > _MOST_ODD * len(rows):
-        raise UsageError(
-            f"the mesh is open: {len(odd)} of {len(rows)} rows through it pierce it an odd number of times, and what"
-            " lies inside is not defined; close it first"
-        )
-    if len(odd):
-        mesh, hu = (keys[~np.isin(lattice.row_of(keys), odd)] for keys in (mesh, hu))
-    inside, wanted = count_points(mesh), count_points(hu)
-    apart = count_points(exclusive_or(mesh, hu))
-    return _Counts(inside, wanted, (inside + wanted - apart) // 2, len(odd))
 
 
 _PIECE = 1 << 16
@@ -306,20 +309,17 @@ def exclusive_or(first: Keys, second: Keys) -> Keys:
     return np.asarray(keys[alone])
 
 
-def find_level_runs(
-    volume: Volume, rule: IsoRule, lattice: Lattice, report: Callable[[int], None], most: int = _SLAB_VOXELS
-) -> Keys:
+def find_level_runs(volume: Volume, rule: IsoRule, lattice: Lattice, most: int = _SLAB_VOXELS) -> Keys:
     """Find the ends of runs of points, (n,) int64, ascending, where the trilinear HU reach the one level of a rule.
 
     A trilinear field has its extremes at the corners of a cell: only cells with corners on both sides have points on
-    both sides.  `report` is called with the number of layers of cells that are done.
+    both sides.
     """
     layers = lattice.cells_ijk[2]
     ni, nj, _ = volume.shape_ijk
     step = max(1, most // (ni * nj))
     runs = [np.zeros(0, dtype=np.int64)]
     for first in range(0, layers, step):
-        report(first)
         samples = _slices_with_border(volume, rule, first, min(first + step, layers) + 1)
         runs.append(np.sort(_runs_in(samples, rule, lattice, first)))
     return np.concatenate(runs)

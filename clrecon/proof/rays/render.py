@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -127,7 +128,10 @@ def voxel_gradients(voxels: NDArray, matrices: Float64Array) -> Float64Array:
         wide[inner, 2:, inner] - wide[inner, :-2, inner],
         wide[2:, inner, inner] - wide[:-2, inner, inner],
     ]
-    return np.einsum("kxa,kjia->kjix", matrices, 0.5 * np.stack(along, axis=-1))
+    gradients = np.zeros((*voxels.shape, 3))
+    for x, a in np.argwhere(matrices.any(axis=0)):
+        gradients[..., x] += 0.5 * matrices[:, x, a, None, None] * along[a]
+    return gradients
 
 
 def hash_pixels(x: NDArray[np.integer], y: NDArray[np.integer]) -> NDArray[np.uint32]:
@@ -277,12 +281,16 @@ Found = tuple[Float64Array, Float64Array, Float64Array, Float64Array]
 """rgba (n, 4), depth, expected depth and values (n,)."""
 
 
+@lru_cache(maxsize=2)
+def _list_nodes(function: TransferFunction) -> Float64Array:
+    return function.table(*function.range_hu, TABLE_NODES).astype(np.float64)
+
+
 def look_up(transfer_function: TransferFunction, hu: Float64Array) -> Float64Array:
     """Return colour and opacity (n, 4) of the nearest of `TABLE_NODES` even HU over the function's range, float32."""
     low, high = transfer_function.range_hu
-    nodes = transfer_function.table(low, high, TABLE_NODES).astype(np.float64)
     number = np.floor((hu - low) * ((TABLE_NODES - 1) / (high - low)) + 0.5)
-    return np.asarray(nodes[np.clip(number, 0, TABLE_NODES - 1).astype(np.int64)])
+    return np.asarray(_list_nodes(transfer_function)[np.clip(number, 0, TABLE_NODES - 1).astype(np.int64)])
 
 
 def shade(
@@ -341,7 +349,8 @@ def _composite(rays: _Rays, style: VolumeLook, step: float, part: Float64Array, 
     transfer_function, lighting = style.function, style.light
     find_light = _find_light(rays.volume, style)
     matrices = slice_normal_matrices(rays.volume, 0)
-    gradients, lit_gradients = voxel_gradients(voxels, matrices), voxel_gradients(lit, matrices)
+    gradients = None if transfer_function.gradient_opacity is None else voxel_gradients(voxels, matrices)
+    lit_gradients = voxel_gradients(lit, matrices)
     rgba = np.zeros((rays.count, 4))
     depth, weighted = np.full(rays.count, np.nan), np.zeros(rays.count)
     steep = _SteepSegments(rays, transfer_function, step, part)
@@ -357,7 +366,7 @@ def _composite(rays: _Rays, style: VolumeLook, step: float, part: Float64Array, 
         length, opacity = length[seen], opacity[seen]
         colour = look_up(transfer_function, values[seen])[:, :3]
         ijk, _ = rays.places(ray, t)
-        if transfer_function.gradient_opacity is not None:
+        if gradients is not None:
             slope = sample_field(gradients, ijk)
             opacity = opacity * transfer_function.gradient_factor(np.linalg.norm(slope, axis=1))
         slope = sample_field(lit_gradients, ijk)
@@ -385,8 +394,7 @@ class _SteepSegments:
         self.step, self.part = step, part
         low, high = function.range_hu
         self.low, self.scale = low, (TABLE_NODES - 1) / (high - low)
-        table = function.table(low, high, TABLE_NODES)[:, 3].astype(np.float64)
-        self.clear = (1.0 - table) ** (step / function.unit_distance)
+        self.clear = (1.0 - _list_nodes(function)[:, 3]) ** (step / function.unit_distance)
         self.steepness = Steepness.of((1.0 - self.clear).astype(np.float32), self.scale)
         self.is_there = self.steepness.is_steep and takes_parts(rays.volume, step)
         shown = np.flatnonzero(self.clear < 1.0)

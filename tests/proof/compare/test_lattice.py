@@ -52,21 +52,11 @@ def test_runs_of_lattice_points_inside_are_those_of_the_trilinear_field(make_vol
     ni, nj, _ = volume.shape_ijk
     layers_at_once = 4
 
-    keys = find_level_runs(volume, rule, lattice, lambda _: None, most=layers_at_once * ni * nj)
+    keys = find_level_runs(volume, rule, lattice, most=layers_at_once * ni * nj)
 
     assert (np.diff(keys) > 0).all()  # ends of runs in rising order
     assert np.array_equal(filled(keys, lattice).ravel(), wanted)
     assert count_points(keys) == np.count_nonzero(wanted)
-
-
-def test_search_for_runs_tells_the_first_layer_of_each_part():
-    volume = noise()
-    ni, nj, _ = volume.shape_ijk
-    rule = choose_iso_rule(volume, float(np.median(volume.voxels)) + 0.37)
-    lattice = Lattice.over(volume, rule, finer=3, offsets=(0.137, 0.271, 0.389))
-    told: list[int] = []
-    find_level_runs(volume, rule, lattice, told.append, most=4 * ni * nj)  # four layers of cells at once
-    assert told == list(range(0, lattice.cells_ijk[2], 4))
 
 
 @pytest.mark.parametrize(
@@ -82,7 +72,7 @@ def test_lattice_counts_no_point_of_a_constant_volume_below_the_level_and_all_of
     volume = Volume(np.full((4, 5, 6), value, np.int16), OBLIQUE)
     rule = choose_iso_rule(volume, 5.0, closed=closed)
     lattice = Lattice.over(volume, rule, finer=1, offsets=(0.0, 0.0, 0.0))
-    assert count_points(find_level_runs(volume, rule, lattice, lambda _: None)) == inside
+    assert count_points(find_level_runs(volume, rule, lattice)) == inside
 
 
 def test_exclusive_or_of_runs_has_the_points_of_one_alone():
