@@ -41,6 +41,10 @@ def package_of(module: str) -> str:
     return _INSTALLED_AS.get(top, top)
 
 
+def is_installed(module: str) -> bool:
+    return importlib.util.find_spec(module) is not None
+
+
 def import_package(module: str, subject: str) -> Any:
     """Import a module that `subject` needs; without its package the message says how to install that."""
     show_unused()

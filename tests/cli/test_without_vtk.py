@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,8 @@ import pytest
 
 from clrecon import read_mesh
 from clrecon.cli.main import main
+from clrecon.proof.compare.job import choose_installed
+from clrecon.proof.compare.methods import COMPARED, CompareSettings
 from clrecon.proof.phantom import PhantomSettings, write_phantom
 
 OF_VTK = ("vtk", "vtkmodules", "pyvista")
@@ -59,15 +62,33 @@ def test_command_that_refines_or_writes_files_of_vtk_writes_its_file_without_it(
 
 
 @pytest.mark.usefixtures("ct_without_vtk")
-def test_comparison_without_matplotlib_names_it_and_writes_nothing(
+def test_comparison_without_matplotlib_has_a_page_without_plots_that_says_so_as_its_report_does(
     device: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     hide_packages(monkeypatch, "matplotlib")
 
-    assert main(["compare", "ct", "-o", "report", "--hu", "226", "--device", str(device.index), "-q"]) == 3
+    code = main(f"compare ct -o report --hu 226 --methods t-mc --repeat 1 --device {device.index}".split())
 
-    assert "package matplotlib" in capsys.readouterr().err
-    assert not Path("report").exists()
+    assert code == 0
+    left_out = "left out, their packages are not installed: plots (matplotlib)"
+    assert left_out in " ".join(capsys.readouterr().err.split())
+    assert left_out in json.loads(Path("report/report.json").read_text())["warnings"]
+    page = Path("report/index.html").read_text()
+    assert left_out in page
+    assert "<svg" not in page
+
+
+@pytest.mark.usefixtures("without_vtk")
+def test_all_methods_without_their_packages_are_left_out_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    hide_packages(monkeypatch, "skimage", "matplotlib")
+
+    methods, lines = choose_installed(CompareSettings())
+
+    assert [name for name in COMPARED if name not in [method.name for method in methods]] == [
+        "skimage", "vtk-mc", "vtk-fe"
+    ]  # fmt: skip
+    (line,) = lines
+    assert line.endswith(": skimage (scikit-image), vtk-mc and vtk-fe (vtk), plots (matplotlib)")
 
 
 @pytest.mark.usefixtures("ct_without_vtk")
@@ -122,6 +143,8 @@ def test_command_that_neither_fits_nor_smooths_runs_without_scipy(device: Any, c
         ("mesh ct -o a.stl --smooth", "scipy"),
         ("vertebrae ct -o a.nii.gz", "scipy"),
         ("mesh ct -o a.stl --method skimage", "scikit-image"),
+        ("compare ct -o a --methods skimage", "scikit-image"),
+        ("compare ct -o a --reference skimage", "scikit-image"),
     ],
 )
 def test_command_names_the_package_that_it_lacks_and_writes_nothing(

@@ -75,14 +75,14 @@ INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
     "exchange": frozenset({"vtk", "vtkmodules", "pyvista", "laspy"}),
     "mesh": frozenset({"scipy", "pyvista", "vtk", "vtkmodules", "fast_simplification", "trimesh"}),
     "points": frozenset({"open3d"}),
-    "rendering": frozenset({"scipy", "PIL", "skimage", "imageio_ffmpeg", "pyvista", "vtk", "vtkmodules"}),
+    "rendering": frozenset({"scipy", "PIL", "imageio_ffmpeg", "pyvista", "vtk", "vtkmodules"}),
     "opencl": frozenset({"pyopencl"}),
     # typing_extensions: for type checkers alone, which bring it.
     "operators": frozenset({"pyopencl", "SimpleITK", "skimage", "typing_extensions"}),
     "jobs": frozenset({"PIL", "dask"}),
     "viewer": frozenset({"aiohttp", "PIL", "napari", "pyvista", "vtk", "vtkmodules"}),
     # vtkmodules: peers of the bench and of the comparison, whose page has plots and pictures.
-    "proof": frozenset({"scipy", "pyvista", "skimage", "vtkmodules", "matplotlib", "PIL"}),
+    "proof": frozenset({"scipy", "pyvista", "vtkmodules", "matplotlib", "PIL"}),
     "cli": frozenset({"rich"}),
     "spine": frozenset({"scipy"}),
 }

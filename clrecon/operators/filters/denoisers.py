@@ -1,4 +1,4 @@
-"""Filters under one name: of SimpleITK and scikit-image on the computer's processor, and non-local means."""
+"""Filters under one name: of SimpleITK and scipy on the computer's processor, and non-local means."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def filter_volume(
     progress: Progress | None = None,
     **parameters: float | None,
 ) -> VolumeKind:
-    """Filter a volume by a filter of SimpleITK or scikit-image on the computer's processor, or by non-local means.
+    """Filter a volume by a filter of SimpleITK or scipy on the computer's processor, or by non-local means.
 
     For `clrecon.filter_bilateral`, which runs on the device, see there.
 
@@ -64,7 +64,7 @@ def filter_volume(
         A `DeviceVolume` gets the result uploaded when it is first needed.
     name : {"median", "gaussian", "curvature-flow", "non-local-means"}
         median: SimpleITK, of a box of ``radius_mm`` (default one voxel along each axis) in whole voxels.
-        gaussian: scikit-image, with ``sigma_mm`` (default 0.7).
+        gaussian: scipy, with ``sigma_mm`` (default 0.7).
         curvature-flow: SimpleITK, in mm, with ``iterations`` (default 5) of ``time_step`` (default 0.0625 for voxels of
         1 mm and more, less for smaller ones).
         non-local-means: on the device, slice by slice, with ``sigma_hu`` (default the noise that
@@ -184,10 +184,10 @@ def _run_median(sitk: Any, volume: Volume, asked: dict[str, Any]) -> tuple[NDArr
     return result, {**used, "window": [2 * n + 1 for n in radius]}
 
 
-def _run_gaussian(filters: Any, volume: Volume, asked: dict[str, Any]) -> tuple[NDArray[Any], dict[str, Any]]:
+def _run_gaussian(ndimage: Any, volume: Volume, asked: dict[str, Any]) -> tuple[NDArray[Any], dict[str, Any]]:
     sigma = checked_length("sigma_mm", asked["sigma_mm"], volume)
     steps = [sigma / step for step in reversed(volume.spacing)]
-    result = filters.gaussian(volume.voxels.astype(np.float32), steps, mode="nearest", preserve_range=True)
+    result = ndimage.gaussian_filter(volume.voxels.astype(np.float32), steps, mode="nearest")
     return result, {"sigma_mm": sigma}
 
 
@@ -213,7 +213,7 @@ def _run_non_local_means(
 
 DENOISERS = {
     "median": _Denoiser("SimpleITK", {"radius_mm": None}, _run_median),
-    "gaussian": _Denoiser("skimage.filters", {"sigma_mm": 0.7}, _run_gaussian),
+    "gaussian": _Denoiser("scipy.ndimage", {"sigma_mm": 0.7}, _run_gaussian),
     "curvature-flow": _Denoiser("SimpleITK", {"iterations": 5, "time_step": None}, _run_curvature_flow),
     "non-local-means": _Denoiser(None, {"sigma_hu": None, "patch": 5, "reach": 6}, _run_non_local_means),
 }

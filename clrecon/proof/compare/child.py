@@ -26,15 +26,12 @@ LONG_SECONDS = 1.0
 def run_method(request: Request) -> dict[str, Any]:
     """Run a method: first, warm, its picture; its arrays are files of the request's folder afterwards.
 
-    Return its ``state`` ("done", "failed", "declined" or "missing"), and with "done" the figures, see
+    Return its ``state`` ("done", "failed" or "declined"), and with "done" the figures, see
     `_measure_method`; else ``error``, what kind it is of, and why.
     """
     try:
         with time_limit(request.timeout):
             return {"state": "done", "error": None, "kind": None, **_measure_method(request)}
-    except ImportError as error:
-        name = error.name or COMPARED[request.method].peer or "a library"
-        return {"state": "missing", "kind": "ImportError", "error": f"{name.partition('.')[0]} is not installed"}
     except ClreconError as error:
         state = "failed" if isinstance(error, DeviceError) else "declined"  # it works, and not on this scan
         return {"state": state, "kind": type(error).__name__, "error": str(error), "hung": has_hung_commands()}

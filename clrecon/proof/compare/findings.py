@@ -55,7 +55,7 @@ class MethodRecord(Record):
     """A row of the comparison; docs/contract.md and docs/compare.md explain the measures.
 
     name, title, what, makes: See `clrecon.proof.compare.methods.Compared`.
-    state: {"done", "failed", "declined", "missing"}
+    state: {"done", "failed", "declined"}
     first_s, warm_s: From voxels in memory to the result in memory, in a new process and again (median); no reading, no
         drawing.
     first_parts_s, warm_parts_s: By part: ``read``, ``build``, ``upload``, ``kernels``, ``host``, ``download``,

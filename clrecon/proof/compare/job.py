@@ -11,6 +11,7 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -32,7 +33,7 @@ from clrecon.proof.compare.figures import (
     find_planes,
 )
 from clrecon.proof.compare.findings import CompareReport
-from clrecon.proof.compare.methods import COMPARED, CompareSettings
+from clrecon.proof.compare.methods import COMPARED, Compared, CompareSettings
 from clrecon.proof.compare.page import make_page
 from clrecon.proof.compare.processes import Request, measure_in_processes, run_in_process, save_volume
 from clrecon.proof.compare.records import Given, compose_report, make_record
@@ -40,10 +41,10 @@ from clrecon.proof.phantom import phantom_truth
 from clrecon.reading import read_selected
 from clrecon.system.files import StagedFolder, check_folder, temporary_folder
 from clrecon.system.log import get_logger, log_warnings
-from clrecon.system.packages import import_package
+from clrecon.system.packages import is_installed, missing_package, package_of
 from clrecon.system.paths import final_mode, keep_existing, system_errors
 from clrecon.system.progress import Progress, device_seconds, ignore_progress
-from clrecon.system.text import format_hu
+from clrecon.system.text import format_hu, list_names
 
 PAGE, REPORT = "index.html", "report.json"
 
@@ -108,7 +109,7 @@ def make_comparison(
     """Run all methods on one scan at one level, measure what they make, and write the page.
 
     Each method runs in a process of its own, one after another: the first run in a new process, then warm ones.  A
-    method that fails, or whose library is not installed, is a row that says so.
+    method that fails is a row that says so; a warning names the methods and plots whose packages are not installed.
 
     source: See `clrecon.reading.read_volume`.
     output: Folder for ``index.html``, ``report.json`` and pictures: a new or empty one, or that of an earlier
@@ -118,12 +119,13 @@ def make_comparison(
     progress = progress or ignore_progress
     watch = Laps()
     truth = None if settings.truth is None else _check_truth(Path(settings.truth))
-    import_package("matplotlib.figure", "the page of a comparison")
+    methods, left_out = choose_installed(settings)
     with keep_existing(keep=no_clobber):
         folder = check_report_folder(output)
     check_kept([("the report", output)], source, settings.truth)
     volume, device, read_s = _open_input(source, settings, progress, watch)
     given = _prepare_volume(volume, settings, device, progress)
+    given = given._replace(warnings=[*left_out, *given.warnings])
     volume, level = given.volume, given.level
     watch.lap("mask")
     with ExitStack() as stack:
@@ -132,7 +134,7 @@ def make_comparison(
             save_volume(work, volume)
         figures = Figures(work, volume, level, settings.reference)
         figures.planes, figures.box = find_planes(volume, level)
-        rows = _run_methods(figures, settings, device, progress)
+        rows = _run_methods(figures, methods, settings, device, progress)
         watch.lap("methods")
         measured = _measure_methods(rows, figures, settings, truth, progress)
         watch.lap("measure")
@@ -153,6 +155,21 @@ def make_comparison(
     log_warnings(log, report.warnings, volume.report.get("warnings", ()))
     log.info("%d methods compared on %s in %.3f s", len(records), report.device, watch.total())
     return report
+
+
+def choose_installed(settings: CompareSettings) -> tuple[list[Compared], list[str]]:
+    """Return the methods whose packages are installed, and a line on what is left out; named methods must be there."""
+    absent: dict[str, list[str]] = {}
+    needs = [(method.name, method.module) for method in settings.chosen if method.module]
+    for name, module in (*needs, ("plots", "matplotlib")):
+        if not is_installed(module):
+            if name in (*settings.methods, settings.reference):
+                raise missing_package(module, f"the method {name}")
+            absent.setdefault(package_of(module), []).append(name)
+    lacking = ", ".join(f"{list_names(names)} ({package})" for package, names in absent.items())
+    left_out = [f"left out, their packages are not installed: {lacking}"] if absent else []
+    unavailable = set(chain(*absent.values()))
+    return [method for method in settings.chosen if method.name not in unavailable], left_out
 
 
 def _check_truth(path: Path) -> str:
@@ -201,16 +218,16 @@ def _prepare_volume(volume: Volume, settings: CompareSettings, device: Device, p
 
 
 def _run_methods(
-    figures: Figures, settings: CompareSettings, device: Device, progress: Progress
+    figures: Figures, methods: Sequence[Compared], settings: CompareSettings, device: Device, progress: Progress
 ) -> dict[str, dict[str, Any]]:
     """Run the methods one after another; those on a device that hangs are not tried any more."""
-    volume, chosen = figures.volume, settings.chosen
+    volume = figures.volume
     camera = choose_camera(volume, figures.box)
     along = along_slices(volume) if settings.paper else None
     rows: dict[str, dict[str, Any]] = {}
     hung = False
-    for done, method in enumerate(chosen):
-        progress("compare methods", done, len(chosen))
+    for done, method in enumerate(methods):
+        progress("compare methods", done, len(methods))
         if hung and method.on_device:
             rows[method.name] = {"state": "failed", "kind": "DeviceError", "error": "not run: the device hangs"}
             continue
@@ -221,7 +238,7 @@ def _run_methods(
         )  # fmt: skip
         rows[method.name] = run_in_process(request)
         hung = hung or bool(rows[method.name].get("hung"))
-    progress("compare methods", len(chosen), len(chosen))
+    progress("compare methods", len(methods), len(methods))
     _refuse_nothing(rows)
     return rows
 

@@ -20,14 +20,14 @@ PICTURE = "picture"
 
 @dataclass(frozen=True)
 class Compared:
-    """A method that is compared, by a `peer` or clrecon, on the device or not: a "mesh", "cloud" or "picture"."""
+    """A method that is compared, by a `module` of others or clrecon, on the device or not: makes `MESH` or others."""
 
     name: str
     title: str
     what: str
     makes: str = MESH
     on_device: bool = True
-    peer: str = ""
+    module: str = ""
 
 
 COMPARED = {
@@ -35,9 +35,9 @@ COMPARED = {
     for method in (
         Compared("t-mc", "T-MC", "marching cubes, every cell, shared vertices"),
         Compared("t-mc-soup", "T-MC, soup", "every cell, triangles welded afterwards (numpy)", on_device=False),
-        Compared("skimage", "scikit-image", "marching cubes of scikit-image", on_device=False, peer="scikit-image"),
-        Compared("vtk-mc", "VTK MC", "vtkMarchingCubes", on_device=False, peer="vtk"),
-        Compared("vtk-fe", "VTK FE", "vtkFlyingEdges3D", on_device=False, peer="vtk"),
+        Compared("skimage", "scikit-image", "marching cubes of scikit-image", on_device=False, module="skimage"),
+        Compared("vtk-mc", "VTK MC", "vtkMarchingCubes", on_device=False, module="vtkmodules"),
+        Compared("vtk-fe", "VTK FE", "vtkFlyingEdges3D", on_device=False, module="vtkmodules"),
         Compared("i-mc", "I-MC", "cells grown from the large parts, linear vertices"),
         Compared("i-mc-golden", "I-MC, golden", "the same, vertices at the golden section of their edge"),
         Compared("g-mc", "G-MC", "T-MC, then quadric collapse without a bound"),

@@ -18,6 +18,7 @@ from clrecon.proof.compare.figures import COLORS, Figures, embed
 from clrecon.proof.compare.findings import CompareReport, MethodRecord, seconds, share
 from clrecon.proof.compare.records import ALL_PARTS
 from clrecon.proof.compare.table import main_table, paper_table, shown_columns, small_table
+from clrecon.system.packages import is_installed
 from clrecon.system.text import list_names
 
 
@@ -220,8 +221,7 @@ def make_page(report: CompareReport, figures: Figures) -> str:
     parts = (
         _section("What the numbers say", _findings(report)),
         _section("All methods", f'{main_table(report, COLORS)}\n<p class="note">{note}</p>\n{small_table(report)}'),
-        _section("Where the time goes", _times(report)),
-        _section("Triangles and error", _accuracy(report)),
+        *(_sections_of_plots(report) if is_installed("matplotlib") else ()),
         _section("The same view", _views(report, figures)),
         _section("Slices with contours", _slices(report, figures)),
         _section("Against the middle slice, as a paper does", _paper(report)),
@@ -242,6 +242,10 @@ def make_page(report: CompareReport, figures: Figures) -> str:
         facts="\n".join(f"<div><dt>{escape(name)}</dt><dd>{escape(said)}</dd></div>" for name, said in _facts(report)),
         body="\n".join(filter(None, parts)),
     )
+
+
+def _sections_of_plots(report: CompareReport) -> tuple[str, str]:
+    return _section("Where the time goes", _times(report)), _section("Triangles and error", _accuracy(report))
 
 
 def _section(title: str, content: str) -> str:

@@ -19,6 +19,7 @@ from clrecon.proof.compare.findings import CompareReport, MethodRecord, find_fin
 from clrecon.proof.compare.makers import PARTS, TWIN_SIZE
 from clrecon.proof.compare.methods import Compared, CompareSettings
 from clrecon.proof.timing import free_cores, processor_name, usable_cores
+from clrecon.system.packages import package_of
 from clrecon.version import package_version
 
 ALL_PARTS = ("read", *PARTS)
@@ -51,7 +52,7 @@ def make_record(
         title=method.title,
         what=method.what,
         makes=method.makes,
-        peer=method.peer,
+        peer=package_of(method.module),
         state=result["state"],
         error=result["error"],
         triangles=result.get("triangles"),

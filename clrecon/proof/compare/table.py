@@ -176,8 +176,7 @@ def _row(
     swatch = f'<span class="swatch" style="background:{colors[record.name]}"></span>'
     name = f'<th scope="row">{swatch}{escape(record.title)}<small>{escape(record.what)}</small></th>'
     if not record.is_done:
-        state = "not installed" if record.state == "missing" else record.state
-        words = f"{state}: {escape(record.error or '')}"
+        words = f"{record.state}: {escape(record.error or '')}"
         return f'<tr class="failed">{name}<td colspan="{len(columns) + 1}">{words}</td></tr>'
     is_reference = reference is not None and record.name == reference.name
     cells = []

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
+from clrecon.geometry.affine import Float64Array
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.light_dataclass import dataclass
-from clrecon.system.packages import import_package
 from clrecon.system.records import Record
 
 WINDOW = 7
@@ -80,11 +80,26 @@ def measure_pictures(
     (top, bottom), (left, right) = (
         (0, size) if whole else _span(drawn.any(axis=1 - axis)) for axis, size in enumerate((rows, columns))
     )
-    given, wanted = given[top:bottom, left:right], wanted[top:bottom, left:right]
-    difference = given.astype(np.float64) - wanted
-    metrics = import_package("skimage.metrics", "measure_pictures")
-    similarity = float(metrics.structural_similarity(given, wanted, win_size=WINDOW, data_range=RANGE, channel_axis=2))
-    return PictureLikeness(float(np.mean(difference * difference)), similarity, (top, left, bottom, right))
+    first, second = (pixels[top:bottom, left:right].astype(np.float64) for pixels in (given, wanted))
+    mse = float(np.mean((first - second) ** 2))
+    return PictureLikeness(mse, _measure_similarity(first, second), (top, left, bottom, right))
+
+
+def _measure_similarity(first: Float64Array, second: Float64Array) -> float:
+    """Return the mean of SSIM over all windows in two pictures (rows, columns, channels)."""
+    from scipy.ndimage import uniform_filter
+
+    def average(values: Float64Array) -> Float64Array:
+        margin = WINDOW // 2
+        return np.asarray(uniform_filter(values, (WINDOW, WINDOW, 1))[margin:-margin, margin:-margin])
+
+    unbiased = WINDOW**2 / (WINDOW**2 - 1)
+    c1, c2 = (0.01 * RANGE) ** 2, (0.03 * RANGE) ** 2
+    mean, mean_2 = average(first), average(second)
+    variances = average(first**2) - mean**2 + average(second**2) - mean_2**2
+    covariance = average(first * second) - mean * mean_2
+    alike = (2.0 * mean * mean_2 + c1) * (2.0 * unbiased * covariance + c2)
+    return float(np.mean(alike / ((mean**2 + mean_2**2 + c1) * (unbiased * variances + c2))))
 
 
 def _as_picture(pixels: ArrayLike, background: Sequence[int] | int) -> NDArray[np.uint8]:

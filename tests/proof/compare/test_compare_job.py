@@ -272,8 +272,8 @@ def test_comparison_in_one_process_has_the_figures_and_pictures_of_one_with_a_pr
 @pytest.mark.parametrize(
     ("state", "named", "is_missed"),
     [
-        ("done", (), False), ("declined", (), False), ("missing", (), False), ("failed", (), True),
-        ("declined", ("vtk-mc",), True), ("missing", ("vtk-mc",), True), ("declined", ("skimage",), False),
+        ("done", (), False), ("declined", (), False), ("failed", (), True),
+        ("declined", ("vtk-mc",), True), ("declined", ("skimage",), False),
     ],
 )  # fmt: skip
 def test_only_a_failed_method_or_a_named_one_that_did_not_run_fails_the_comparison(
@@ -295,7 +295,7 @@ def test_method_that_refuses_its_input_has_declined_and_one_without_a_device_has
 
 
 @pytest.mark.seconds
-def test_comparison_with_a_crashed_and_a_missing_method_ends_with_8_and_tells_why_in_report_and_page(
+def test_comparison_with_a_crashed_and_a_broken_method_ends_with_8_and_tells_why_in_report_and_page(
     device: Any, ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Printer
 ) -> None:
     run_instead(monkeypatch, tmp_path.with_suffix(".code"), "clrecon.proof.compare.child", ONE_CRASHES)
@@ -306,14 +306,14 @@ def test_comparison_with_a_crashed_and_a_missing_method_ends_with_8_and_tells_wh
     assert code == 8
     rows = {method["name"]: (method["state"], method["error"]) for method in read_report(tmp_path / "r")["methods"]}
     assert rows["t-mc"] == ("done", None)
-    assert rows["vtk-mc"] == ("missing", "vtkmodules is not installed")
+    assert rows["vtk-mc"] == ("failed", "ModuleNotFoundError: import of vtkmodules halted; None in sys.modules")
     state, reason = rows["skimage"]
     assert state == "failed"
     assert "crashed with SIGABRT" in reason
     page = (tmp_path / "r" / "index.html").read_text()
     assert find_faults(page) == []
     assert "failed: its process crashed with SIGABRT" in page
-    assert "not installed: vtkmodules" in page
+    assert "failed: ModuleNotFoundError: import of vtkmodules" in page
     printed().assert_output("VTK", "MC")
 
 
