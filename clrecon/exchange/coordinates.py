@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
 from clrecon.geometry.vertices import float32_step, is_far
-from clrecon.system.pieces import find_bounds, in_threads
+from clrecon.system.pieces import find_bounds, in_threads, list_distinct
 
 _MOST_STEPS_APART = 64
 
@@ -65,15 +65,33 @@ def find_coincident(vertices: NDArray[np.floating]) -> NDArray[np.int64]:
 
     When a file without indices, such as STL, is read, they are joined: a surface closed by index can then be open.
     """
-    mixed = _scramble(vertices)
-    ordered = np.sort(mixed)
-    repeated = ordered[1:][ordered[1:] == ordered[:-1]]
-    if len(repeated) == 0:
-        return np.zeros(0, dtype=np.int64)
-    suspects = np.flatnonzero(np.isin(mixed, repeated))
+    suspects = _find_repeated(_scramble(vertices, np.uint32))
+    if len(suspects) == 0:
+        return suspects
     suspects = suspects[np.lexsort(vertices[suspects].T[::-1])]
     same = (vertices[suspects[1:]] == vertices[suspects[:-1]]).all(axis=1)
-    return suspects[np.concatenate([same, [False]]) | np.concatenate([[False], same])]
+    return suspects[np.append(same, False) | np.insert(same, 0, False)]
+
+
+def _find_repeated(numbers: NDArray[np.uint32]) -> NDArray[np.int64]:
+    """Return where numbers are that occur several times, rising, by tables in which each number has a slot, or shares
+    it: sorting them takes longer.
+    """
+    kind = np.int32 if len(numbers) < 2**31 else np.int64
+    left, rows = np.arange(len(numbers), dtype=kind), [np.empty(0, kind)]
+    while len(left):
+        bits, here = len(left).bit_length(), np.arange(len(left), dtype=kind)
+        slots = (numbers >> np.uint32(32 - bits)).astype(np.intp)
+        table = np.empty(1 << bits, kind)
+        table[slots] = here
+        owners = table.take(slots, mode="clip")
+        shared = np.flatnonzero(owners != here)
+        owners, hidden = owners.take(shared), numbers.take(shared)
+        same = hidden == numbers.take(owners)
+        rows += [left[owners[same]], left[shared[same]]]
+        left = left[shared[~same]]
+        numbers = hidden[~same] * np.uint32(0x85EBCA6B)  # other bits come to the top
+    return list_distinct(np.concatenate(rows))
 
 
 def find_places(vertices: NDArray[np.floating]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -116,14 +134,16 @@ def _find_firsts(vertices: NDArray[np.floating]) -> NDArray[np.int64]:
     return firsts
 
 
-def _scramble(vertices: NDArray[np.floating]) -> NDArray[np.uint64]:
+def _scramble(vertices: NDArray[np.floating], kind: type[np.unsignedinteger] = np.uint64) -> NDArray[Any]:
     """Return a sum of scrambled coordinates: only vertices with equal sums have to be compared in full."""
-    mixed = np.zeros(len(vertices), dtype=np.uint64)
-    for column in vertices.T:
-        with np.errstate(invalid="ignore"):  # harmed bits
-            bits = (column + column.dtype.type(0)).view(f"u{column.dtype.itemsize}")  # + 0 turns -0 into 0
-        mixed = (mixed ^ bits) * np.uint64(0x9E3779B97F4A7C15)
-        mixed ^= mixed >> np.uint64(29)
+    mixed = np.zeros(len(vertices), kind)
+    shift, factor = kind(4 * mixed.itemsize - 3), kind(0x9E3779B97F4A7C15 >> (64 - 8 * mixed.itemsize) | 1)
+    with np.errstate(invalid="ignore"):  # harmed bits
+        numbers = np.add(vertices, vertices.dtype.type(0), order="C")  # + 0 turns -0 into 0
+    for word in np.ascontiguousarray(numbers.view(f"u{min(numbers.itemsize, mixed.itemsize)}").T):
+        mixed ^= word
+        mixed *= factor
+        mixed ^= mixed >> shift
     return mixed
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from clrecon.exchange.content import write_lines
-from clrecon.exchange.coordinates import _scramble, find_places, rounded_apart
+from clrecon.exchange.coordinates import _scramble, find_coincident, find_places, rounded_apart
 
 pytestmark = pytest.mark.unit
 
@@ -50,6 +50,17 @@ def test_places_with_one_hash_are_told_apart():
 
     assert first_of_place.tolist() == [0, 1, 4]
     assert place_of_vertex.tolist() == [0, 1, 0, 1, 2]
+
+
+def test_coincident_vertices_are_found_among_different_ones_with_the_same_hash():
+    vertices = np.random.default_rng(2).random((300_000, 3)).astype(np.float32)
+    assert len(np.unique(_scramble(vertices, np.uint32))) < 300_000  # ten pairs of them by chance, 300,000^2 / 2^33
+    vertices[[7, 150_000, 299_999]] = vertices[42]
+    vertices[8] = vertices[9] * [1, 0, 1]
+    vertices[9, 1] = -0.0
+
+    first, second = sorted([[7, 42, 150_000, 299_999], [8, 9]], key=lambda rows: vertices[rows[0]].tolist())
+    assert find_coincident(vertices).tolist() == [*first, *second]
 
 
 @pytest.mark.parametrize("form", ["v %.9g %.9g %.9g\n", "%.9g,%.9g,%.9g;"], ids=["vertices of OBJ", "commas"])

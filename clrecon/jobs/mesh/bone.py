@@ -152,7 +152,7 @@ def _holds_spine(mesh: Mesh, volume: Volume, count: int, labels: NDArray[np.int6
 
 
 def judge_surfaces(
-    parts: Sequence[Part], volume: Volume, settings: MeshSettings, label: Callable[[Mesh], Labelled]
+    parts: Sequence[Part], volume: Volume, settings: MeshSettings, label: Callable[[Part], Labelled]
 ) -> None:
     """Store in the `facts` of each part ``walls``, judged by HU; `label` numbers components judged alone."""
     import numpy as np
@@ -182,7 +182,7 @@ def judge_surfaces(
                 continue
             faint = judged["looks_like"] != "bone" or judged["compact_share"] <= 1.0 - OTHER_SHARE
             if faint or is_straight(own_walls.points, volume):
-                part.bones = _count_bones(part.mesh, volume, rule, label(part.mesh))
+                part.bones = _count_bones(part.mesh, volume, rule, label(part))
 
 
 def _count_bones(mesh: Mesh, volume: Volume, rule: IsoRule, labelled: Labelled) -> Bones:

@@ -16,10 +16,11 @@ from clrecon.exchange.formats import check_assembly, check_in_pieces, check_tria
 from clrecon.geometry import Volume, frame_from_lps
 from clrecon.jobs.mesh.bone import judge_surfaces, warn_of_walls
 from clrecon.jobs.mesh.labels import describe_label, judge_label_volumes, name_label_files
-from clrecon.jobs.mesh.make import MadeParts, first_names, label_parts, make_parts
+from clrecon.jobs.mesh.make import MadeParts, first_names, make_parts
 from clrecon.jobs.mesh.purposes import describe_purposes
 from clrecon.jobs.mesh.refinement import (
     judge_parts,
+    label_part,
     place_on_cortex,
     refine_and_measure,
     warn_of_crumbs,
@@ -309,7 +310,8 @@ def make_mesh(
             for part, path in zip(parts, paths, strict=True):
                 check_triangles(part.mesh.triangle_count, path)
         is_measured = settings.strict or (report_path is not None if measure is None else measure)
-        judge_surfaces(parts, result.volume, settings, partial(label_parts, device=result.device, settings=settings))
+        label = partial(label_part, device=result.device, settings=settings, measure=is_measured)
+        judge_surfaces(parts, result.volume, settings, label)
         run.lap("select")
         gates = _refine_and_measure(run, result, is_measured)
         warnings = [

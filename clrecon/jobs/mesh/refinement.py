@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from clrecon.errors import DeviceError, DeviceFailedError, NoSurfaceError
+from clrecon.jobs.mesh.make import label_parts
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import VALUE_GATES, Part
 from clrecon.jobs.presets import HIGHEST_BONE_HU, LOWEST_BONE_HU
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from clrecon.geometry.iso_rule import IsoRule
     from clrecon.jobs.mesh.make import MadeParts
     from clrecon.mesh import Mesh
+    from clrecon.mesh.components import Labelled
     from clrecon.mesh.connectivity import Topology
     from clrecon.opencl import Device
 
@@ -238,7 +240,7 @@ def measure_parts(
     progress: Progress = ignore_progress,
 ) -> None:
     """Measure the `quality` of each part and its distances from the scan; with `strict` triangles that cut others."""
-    topologies = [_find_topology(part.mesh, device, settings) for part in parts]
+    topologies = [part.topology or _find_topology(part.mesh, device, settings) for part in parts]
     if settings.strict:
         steps = Steps(progress, "crossings", sum(part.mesh.triangle_count for part in parts))
         _, crossings = side_by_side(
@@ -250,6 +252,14 @@ def measure_parts(
             part.quality = part.quality.changed(self_intersections=count)
     else:
         _measure_on_host(parts, topologies, volume, progress)
+
+
+def label_part(part: Part, device: Device, settings: MeshSettings, *, measure: bool = False) -> Labelled:
+    """Number the components of a part; of one to measure as it is, together with the topology that this needs."""
+    if not measure or settings.refines or settings.surface == "cortex":
+        return label_parts(part.mesh, device, settings)
+    part.topology = _find_topology(part.mesh, device, settings)
+    return part.topology.labelled
 
 
 def _find_topology(mesh: Mesh, device: Device | None, settings: MeshSettings) -> Topology:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from clrecon.geometry import Volume
     from clrecon.mesh import Mesh
     from clrecon.mesh.compare.walls import WallLook
+    from clrecon.mesh.connectivity import Topology
     from clrecon.mesh.quality import MeshQuality
 
 
@@ -64,6 +65,7 @@ class Part:
     facts: Further entries of its object in the report.
     pieces: Enclosed volumes of the components of its surface, as extracted and as kept, if the purpose needs them.
     bones: Counted if some of it does not look like bone.
+    topology: Of the mesh as it is, where it was found before it is measured.
     component_ml: Enclosed volume of each component as written, without sign, where it was measured and has many.
     """
 
@@ -74,6 +76,7 @@ class Part:
     facts: dict[str, Any] = field(default_factory=dict)
     pieces: tuple[dict[str, float], dict[str, float]] | None = None
     bones: Bones | None = None
+    topology: Topology | None = None
     component_ml: NDArray[np.float64] | None = None
 
 

@@ -15,7 +15,8 @@ from clrecon.geometry import Volume
 from clrecon.jobs.distance import doubt_frames
 from clrecon.jobs.inputs import may_be_mesh
 from clrecon.jobs.mesh.bone import judge_surfaces
-from clrecon.jobs.mesh.make import label_parts, make_parts
+from clrecon.jobs.mesh.make import make_parts
+from clrecon.jobs.mesh.refinement import label_part
 from clrecon.jobs.options import changed_fields
 from clrecon.jobs.outputs import commit_all
 from clrecon.jobs.run import JobReport, Run
@@ -125,7 +126,7 @@ def _read_input(path: str | Path, settings: ViewSettings, run: Run) -> _ShownInp
         run.lap("read")
         return shown
     result = make_parts(path, run)
-    label = partial(label_parts, device=result.device, settings=settings.scan)
+    label = partial(label_part, device=result.device, settings=settings.scan)
     judge_surfaces(result.parts, result.volume, settings.scan, label)
     run.lap("select")
     windows = {name: WINDOWS[name] for name in _PAGE_WINDOWS}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import product
 from typing import Any
@@ -35,7 +35,7 @@ _ON_THE_SURFACE = 1e-3
 _LINE_STEPS = 16
 """Number of parts of the line to a voxel on the other side of the level."""
 
-_PIECE = 1 << 15
+_PIECE = 1 << 13
 _CORNERS = [(corner & 1, corner >> 1 & 1, corner >> 2) for corner in range(8)]
 
 Float64Array = NDArray[np.float64]
@@ -59,7 +59,7 @@ def rule_of_report(report: dict[str, Any]) -> IsoRule | None:
 
 
 class _Voxels:
-    """The voxels around places (n, 3), whole i, j, k, up to some steps away; beyond a closed border `outside`."""
+    """The voxels around places, i, j, k whole, (3, n), up to some steps away; beyond a closed border `outside`."""
 
     def __init__(self, volume: Volume, rule: IsoRule, ijk: NDArray[np.int64], steps: range):
         self._values = volume.voxels.reshape(-1)
@@ -67,12 +67,16 @@ class _Voxels:
         self._offsets: list[list[NDArray[np.int64]]] = []
         self._beyond: list[list[NDArray[np.bool_] | None]] = []
         stride = 1
-        for axis, count in enumerate(volume.shape_ijk):
-            places = [ijk[:, axis] + step for step in steps]
-            within = [np.clip(place, 0, count - 1) for place in places]
-            beyond = [one != other for one, other in zip(within, places, strict=True)]
-            self._beyond.append([marks if rule.closed and marks.any() else None for marks in beyond])
-            self._offsets.append([place * stride for place in within])
+        for numbers, count in zip(ijk, volume.shape_ijk, strict=True):
+            places = [numbers + step for step in steps]
+            marks: list[NDArray[np.bool_] | None] = [None] * len(steps)
+            if len(numbers) and (numbers.min() + steps.start < 0 or numbers.max() + steps.stop > count):
+                within = [np.clip(place, 0, count - 1) for place in places]
+                if rule.closed:
+                    marks = [one != other for one, other in zip(within, places, strict=True)]
+                places = within
+            self._beyond.append(marks)
+            self._offsets.append([place * stride for place in places])
             stride *= count
 
     def at(self, step: Sequence[int]) -> Float64Array:
@@ -92,37 +96,46 @@ def trilinear_field(volume: Volume, rule: IsoRule, ijk: Float64Array) -> tuple[F
     Beyond the border of a closed volume the value is `outside` of the rule; for an open one, points there are moved to
     it.
     """
-    value, gradient = np.zeros(len(ijk)), np.zeros((3, len(ijk)))
-    for corner, sample, (x, y, z) in _corners(volume, rule, ijk):
-        value += sample * (x * y * z)
-        for along, bit, others in zip(gradient, corner, (y * z, z * x, x * y), strict=True):
-            along += (sample if bit else -sample) * others
+    cell, shares = _split_cells(volume, rule, ijk.T)
+    voxels, (x, y, z) = _Voxels(volume, rule, cell, range(2)), ((1.0 - share, share) for share in shares)
+    xy, yz, zx = ([[own * other for other in second] for own in first] for first, second in ((x, y), (y, z), (z, x)))
+    value, gradient = np.zeros(len(ijk)), np.zeros(shares.shape)
+    part = np.empty_like(value)
+    for i, j, k in _CORNERS:
+        sample = voxels.at((i, j, k))
+        np.multiply(xy[i][j], z[k], out=part)
+        part *= sample
+        value += part
+        for along, is_upper, others in zip(gradient, (i, j, k), (yz[j][k], zx[k][i], xy[i][j]), strict=True):
+            np.multiply(sample, others, out=part)
+            (np.add if is_upper else np.subtract)(along, part, out=along)
     return value, gradient.T
 
 
 def trilinear_values(volume: Volume, rule: IsoRule, ijk: Float64Array) -> Float64Array:
     """Return only the values of `trilinear_field`, in less time."""
+    cell, shares = _split_cells(volume, rule, ijk.T)
+    voxels, (x, y, z) = _Voxels(volume, rule, cell, range(2)), ((1.0 - share, share) for share in shares)
     value = np.zeros(len(ijk))
-    for _, sample, (x, y, z) in _corners(volume, rule, ijk):
-        value += sample * (x * y * z)
+    for i, j, k in _CORNERS:
+        value += voxels.at((i, j, k)) * (x[i] * y[j] * z[k])
     return value
 
 
-def _corners(volume: Volume, rule: IsoRule, ijk: Float64Array) -> Iterator[tuple[Any, Float64Array, Any]]:
-    """Yield the corners of the cells, i, j, k each 0 or 1, with the voxels there and the weights along i, j, k."""
-    cell, shares = _split_cells(volume, rule, ijk)
-    voxels, weights = _Voxels(volume, rule, cell, range(2)), [(1.0 - share, share) for share in shares.T.copy()]
-    for corner in _CORNERS:
-        yield corner, voxels.at(corner), [both[bit] for both, bit in zip(weights, corner, strict=True)]
-
-
 def _split_cells(volume: Volume, rule: IsoRule, ijk: Float64Array) -> tuple[NDArray[np.int64], Float64Array]:
-    """Return the lowest corner of each point's cell, and the position of the point in it."""
-    size = np.array(volume.shape_ijk)
-    low = -rule.border
-    point = np.clip(ijk, low, size - 1 + rule.border)
-    cell = np.clip(np.floor(point).astype(np.int64), low, np.maximum(size - 2 + rule.border, low))
-    return cell, point - cell
+    """Return the lowest corner of each point's cell, and the position of the point in it, all (3, n)."""
+    points = _keep_within(volume, rule, ijk)
+    cell = np.empty(points.shape, np.int64)
+    for floors, point, count in zip(cell, points, volume.shape_ijk, strict=True):
+        np.clip(np.floor(point), -rule.border, max(count - 2 + rule.border, -rule.border), out=floors, casting="unsafe")
+    points -= cell
+    return cell, points
+
+
+def _keep_within(volume: Volume, rule: IsoRule, ijk: Float64Array) -> Float64Array:
+    """Return index coordinates, (3, n), beyond the border moved to it: there the field does not change."""
+    ends = zip(ijk, volume.shape_ijk, strict=True)
+    return np.stack([np.clip(numbers, -rule.border, count - 1 + rule.border) for numbers, count in ends])
 
 
 def distances_to_iso_surface(volume: Volume, rule: IsoRule, points: Float64Array) -> Float64Array:
@@ -147,46 +160,47 @@ def distances_to_iso_surface(volume: Volume, rule: IsoRule, points: Float64Array
 
 
 def _distances_to_level(volume: Volume, rule: IsoRule, level: float, points: Float64Array) -> Float64Array:
-    matrices = np.asarray(layer_normal_matrices(volume, rule.border))
+    matrices = np.asarray(layer_normal_matrices(volume, rule.border)).transpose(1, 2, 0)
     longest = 0.5 * smallest_voxel_mm(volume)
     distances = np.full(len(points), np.nan)
-    here = points.copy()
 
-    def take_step(going: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Move points towards the surface; return those that have not reached it."""
-        # Beyond the border the field does not change: a step from there would begin at the border all the same.
-        ijk = np.add(*_split_cells(volume, rule, volume.lps_to_ijk(here.take(going, axis=0))))
-        position = volume.ijk_to_lps(ijk)
-        value, per_step = trilinear_field(volume, rule, ijk)
-        slices = np.clip(np.floor(ijk[:, 2]).astype(np.int64) + rule.border, 0, len(matrices) - 1)
-        gradient = np.einsum("nab,nb->na", matrices.take(slices, axis=0), per_step)
-        square = np.einsum("na,na->n", gradient, gradient)
-        uphill = square > 0.0
-        here[going] = position
-        going = going[uphill]
-        position, value = position[uphill], value[uphill]
-        gradient, square = gradient[uphill], square[uphill]
-        step = ((level - value) / square)[:, None] * gradient
+    def take_step(going: NDArray[np.int64], here: Float64Array) -> tuple[NDArray[np.int64], Float64Array]:
+        """Move points, (3, n), towards the surface; return those that have not reached it, and where they are."""
+        ijk = _keep_within(volume, rule, volume.lps_to_ijk(here.T).T)
+        position = np.ascontiguousarray(volume.ijk_to_lps(ijk.T).T)
+        value, per_step = trilinear_field(volume, rule, ijk.T)
+        slices: Any = slice(1)
+        if volume.uneven:
+            slices = np.clip(np.floor(ijk[2]).astype(np.int64) + rule.border, 0, matrices.shape[2] - 1)
+        rows = matrices[:, :, slices]
+        gradient = rows[:, 0] * per_step[:, 0] + rows[:, 2] * per_step[:, 2] + rows[:, 1] * per_step[:, 1]
+        square = gradient[0] ** 2 + gradient[2] ** 2 + gradient[1] ** 2
+        if not square.all():  # a point of a flat field has no way
+            uphill = square > 0.0
+            going, square = going[uphill], square[uphill]
+            value = value[uphill]
+            position, gradient = position.compress(uphill, axis=1), gradient.compress(uphill, axis=1)
+        step = (level - value) / square * gradient
         length = _lengths(step)
-        step *= np.minimum(1.0, longest / np.maximum(length, longest))[:, None]
+        step *= np.minimum(1.0, longest / np.maximum(length, longest))
         position += step
-        here[going] = position
         there = length <= _ON_THE_SURFACE
         reached = going[there]
-        distances[reached] = _lengths(position[there] - points.take(reached, axis=0))
-        return going[~there]
+        distances[reached] = _lengths(position.compress(there, axis=1) - points.take(reached, axis=0).T)
+        return going[~there], position.compress(~there, axis=1)
 
-    going = np.arange(len(points))
+    going, here = np.arange(len(points)), points.T
     for _ in range(_STEPS):
         if len(going) == 0:
             break
-        going = np.concatenate([take_step(going[piece]) for piece in chunks(len(going), _PIECE)])
+        left = [take_step(going[piece], here[:, piece]) for piece in chunks(len(going), _PIECE)]
+        going, here = (np.concatenate(parts, axis=-1) for parts in zip(*left, strict=True))
     return distances
 
 
 def _lengths(vectors: Float64Array) -> Float64Array:
-    """Return the lengths of vectors, (n, 3), as `numpy.linalg.norm` does, which takes several times as long."""
-    x, y, z = vectors.T
+    """Return the lengths of vectors, (3, n), as `numpy.linalg.norm` does, which takes several times as long."""
+    x, y, z = vectors
     lengths: Float64Array = np.sqrt(x * x + y * y + z * z)
     return lengths
 
@@ -204,8 +218,7 @@ def _distances_along_lines(volume: Volume, rule: IsoRule, level: float, points: 
         nearest = np.full(len(start), np.inf)
 
         def above(ijk: Float64Array) -> Float64Array:
-            value, _ = trilinear_field(volume, rule, ijk.reshape(-1, 3))
-            return (value - level).reshape(ijk.shape[:-1])
+            return trilinear_values(volume, rule, ijk.reshape(-1, 3)).reshape(ijk.shape[:-1]) - level
 
         ends = np.floor(start)[:, None] + corners
         here = above(start)
@@ -268,7 +281,9 @@ def measure_iso_distances(
     """
     result: list[IsoDistance] = []
     waiting: list[_Points] = []
-    known = twice_areas or [_measure_twice_areas(mesh) for mesh in meshes]
+    known = twice_areas or [
+        measure_triangles(mesh.vertices, mesh.triangles, by_triangle=True).twice_areas for mesh in meshes
+    ]
     for number, (mesh, areas) in enumerate(zip(meshes, known, strict=True), start=1):
         waiting.append(_Points.of(mesh, samples, areas))
         if number == len(meshes) or sum(len(each.places) for each in waiting) >= samples:
@@ -279,10 +294,6 @@ def measure_iso_distances(
             result += map(partial(_sum_up, smallest_voxel_mm(volume)), waiting, distances, near_metal)
             waiting.clear()
     return result
-
-
-def _measure_twice_areas(mesh: Mesh) -> Float64Array:
-    return measure_triangles(mesh.vertices, mesh.triangles, by_triangle=True).twice_areas
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,18 +307,17 @@ class _Points:
     @classmethod
     def of(cls, mesh: Mesh, most: int, twice: Float64Array) -> _Points:
         """Take every n-th, at most so many of both; in a mesh without area all stand for the same."""
-        of_triangles = 0.5 * twice if twice.any() else np.ones(len(twice))
+        if not twice.any():
+            twice = np.full(len(twice), 2.0)
         by_vertices, by_triangles = (-(-count // most) or 1 for count in (mesh.vertex_count, mesh.triangle_count))
-        is_taken = np.zeros(mesh.vertex_count, bool)
-        is_taken[::by_vertices] = True
         flat = mesh.triangles.reshape(-1)
-        corners = np.flatnonzero(is_taken.take(flat))
+        corners = np.flatnonzero(flat // by_vertices * by_vertices == flat)  # a remainder is not vectorised
         places = mesh.vertices[::by_vertices].astype(np.float64)
-        of_corners = of_triangles.take(corners // 3) * _AT_A_CORNER
+        of_corners = 0.5 * twice.take(corners // 3) * _AT_A_CORNER
         of_vertices = np.bincount(flat.take(corners) // by_vertices, of_corners, len(places))
         a, b, c = (mesh.vertices.take(corner, axis=0).astype(np.float64) for corner in mesh.triangles[::by_triangles].T)
         both = np.concatenate([places, (a + b + c) / 3.0])
-        at_centres = (1.0 - 3.0 * _AT_A_CORNER) * of_triangles[::by_triangles]
+        at_centres = (1.0 - 3.0 * _AT_A_CORNER) * (0.5 * twice[::by_triangles])
         areas = np.concatenate([by_vertices * of_vertices, by_triangles * at_centres])
         return cls(both, areas, len(places))
 
@@ -351,10 +361,11 @@ def _summarise(distances: Float64Array, areas: Float64Array) -> DistanceSummary 
 def _find_near_metal(volume: Volume, rule: IsoRule, points: Float64Array) -> NDArray[np.bool_]:
     """Return which points have a voxel above `METAL_HU` within `_METAL_REACH`; none at a level of metal."""
     near = np.zeros(len(points), np.bool_)
-    if max(rule.levels) >= METAL_HU or volume.hu_range is None or volume.hu_range[1] <= METAL_HU:
+    hu_range = None if max(rule.levels) >= METAL_HU else volume.hu_range
+    if hu_range is None or hu_range[1] <= METAL_HU:
         return near
     reach = range(-_METAL_REACH, _METAL_REACH + 1)
-    voxels = _Voxels(volume, rule, np.rint(volume.lps_to_ijk(points)).astype(np.int64), reach)
+    voxels = _Voxels(volume, rule, np.rint(volume.lps_to_ijk(points).T).astype(np.int64), reach)
     for step in product(reach, repeat=3):
         near |= voxels.at(step) > METAL_HU
     return near

@@ -81,6 +81,18 @@ def test_keep_bone_leaves_a_larger_heart_out_without_a_warning(
     assert warnings_with("what is kept", report) == []
 
 
+def test_decimated_surface_whose_bones_were_counted_before_is_measured_as_it_is(
+    set_scan: Any, device: Any, tmp_path: Path
+) -> None:
+    set_scan(make_scan(bone=0.0))
+
+    report = mesh_scan(tmp_path, device, preset="bone", decimate=0.5)
+
+    assert len(warnings_with("nothing here looks like bone", report)) == 1
+    assert report["closed"]
+    assert report["quality"]["euler_number"] == report["vertices"] - report["triangles"] // 2  # 3 edges for 2 triangles
+
+
 def test_auto_warns_of_contrast_medium_and_states_its_share(set_scan: Any, device: Any, tmp_path: Path) -> None:
     set_scan(make_scan())
 

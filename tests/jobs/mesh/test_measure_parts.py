@@ -10,7 +10,7 @@ import pytest
 import clrecon
 from clrecon.errors import DeviceMemoryError
 from clrecon.geometry import Volume
-from clrecon.jobs.mesh.refinement import measure_parts
+from clrecon.jobs.mesh.refinement import label_part, measure_parts
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part, Surface
 
@@ -40,6 +40,19 @@ def test_device_and_host_measure_the_same(device: Any, measured_by_host: Part) -
     assert part.facts == measured_by_host.facts
     np.testing.assert_array_equal(part.component_ml, measured_by_host.component_ml)
     assert part.mesh.report["warnings"] == []
+
+
+def test_topology_found_with_the_components_is_not_looked_for_again(
+    device: Any, measured_by_host: Part, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    part = Part(measured_by_host.surface, "", measured_by_host.mesh)
+    count, labels = label_part(part, device, MeshSettings(), measure=True)
+
+    monkeypatch.delattr("clrecon.operators.primitives.union_find.label_fans")
+    measure_parts([part], Volume(VOXELS, np.diag((0.5, 0.7, 1.2, 1.0))), MeshSettings(iso_value=1.0), device)
+
+    assert part.quality == measured_by_host.quality
+    assert (count, labels.tolist()) == (part.quality.components, label_part(part, device, MeshSettings())[1].tolist())
 
 
 def test_mesh_that_does_not_fit_the_device_is_measured_by_the_host_with_a_warning(

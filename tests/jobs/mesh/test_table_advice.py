@@ -67,7 +67,7 @@ def judge_walls_of_a_block(gates: list[dict]) -> tuple[Part, list[str]]:
     volume = Volume(voxels, np.eye(4), {"gates": gates})
     part = Part(Surface(name="", iso_value=190.0), name="", mesh=make_mesh_of(volume, iso_value=190.0))
     settings = MeshSettings(half_way="auto")
-    judge_surfaces([part], volume, settings, lambda mesh: label_components(mesh.triangles, mesh.vertex_count))
+    judge_surfaces([part], volume, settings, lambda part: label_components(part.mesh.triangles, part.mesh.vertex_count))
     return part, warn_of_walls([part], settings)
 
 

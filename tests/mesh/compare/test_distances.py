@@ -16,6 +16,7 @@ from clrecon.mesh.compare.distances import (
     compare_meshes,
     sample_surface,
     sample_surface_points,
+    summarise_distances,
     triangle_distances,
 )
 
@@ -209,6 +210,18 @@ def test_comparing_a_mesh_without_area_is_refused(without_area):
         compare_meshes(Mesh(*rectangle(0.0)), without_area)
     with refused(NoSurfaceError, "area"):
         compare_meshes(without_area, Mesh(*rectangle(0.0)))
+
+
+@pytest.mark.parametrize("heavy", ["all", "near", "far"])
+def test_p95_of_weighted_distances_is_the_one_that_95_percent_of_the_weight_do_not_exceed(heavy):
+    random = np.random.default_rng(8)
+    distances, weights = random.permutation(np.arange(1000.0)), random.random(1000)
+    weights[{"all": slice(0), "near": distances < 500.0, "far": distances >= 900.0}[heavy]] *= 100.0
+
+    p95 = summarise_distances(distances, weights).p95
+
+    assert weights[distances <= p95].sum() >= 0.95 * weights.sum()
+    assert weights[distances < p95].sum() < 0.95 * weights.sum()
 
 
 def test_comparing_without_samples_is_refused():
