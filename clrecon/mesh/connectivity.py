@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from clrecon.geometry.regions import number_connected
 from clrecon.system.light_dataclass import dataclass
+from clrecon.system.pieces import in_threads
 
 _MOST_STEPS = 64
 """Most faces around a vertex that are counted one after the other; vertices with more take the general way."""
@@ -179,17 +180,28 @@ class Fans(Lists):
 
     def sums(self, values: NDArray[np.floating], triangles: NDArray[np.uint32], vertices: IntArray) -> NDArray[Any]:
         """Return sums of values (n, k) over all corners of the triangles around vertices: neighbours count twice."""
-        rows, count = self.around(vertices)
         totals = np.zeros((len(vertices), values.shape[1]), values.dtype)
-        used = count > 0
-        if used.any():
-            is_most = len(rows) > len(triangles)  # each triangle's sum is looked up three times then, not made anew
+        # Where they are most, the sum of each triangle is looked up three times, not made anew.
+        is_most = len(triangles) < int((self.begin[vertices + 1] - self.begin[vertices]).sum())
+        of_all = np.empty((len(triangles) if is_most else 0, values.shape[1]), values.dtype)
+
+        def sum_corners(chosen: NDArray[np.uint32]) -> Any:
             # "clip" avoids checking each index, which takes longer than the look-up.
-            chosen = triangles if is_most else triangles[rows]
             first, second, third = (values.take(corners, axis=0, mode="clip") for corners in chosen.T)
-            of_rows = first + second + third
-            of_rows = of_rows.take(rows, axis=0, mode="clip") if is_most else of_rows
-            totals[used] = np.add.reduceat(of_rows, (np.cumsum(count) - count)[used])
+            return first + second + third
+
+        def sum_triangles(piece: slice) -> None:
+            of_all[piece] = sum_corners(triangles[piece])
+
+        def sum_fans(piece: slice) -> None:
+            rows, count = self.around(vertices[piece])
+            used = count > 0
+            if used.any():
+                of_rows = of_all.take(rows, axis=0, mode="clip") if is_most else sum_corners(triangles[rows])
+                totals[piece][used] = np.add.reduceat(of_rows, (np.cumsum(count) - count)[used])
+
+        in_threads(sum_triangles, len(of_all))
+        in_threads(sum_fans, len(vertices))
         return totals
 
 

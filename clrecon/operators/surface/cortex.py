@@ -35,6 +35,7 @@ from clrecon.opencl import (
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.tables import voxel_variants
 from clrecon.system.light_dataclass import dataclass
+from clrecon.system.pieces import chunks
 from clrecon.system.records import Record
 
 Float32Array = NDArray[np.float32]
@@ -318,16 +319,15 @@ class ProfileSampler:
             self.program = prepare_profiles(self.device, resident.dtype, cubic=cubic)
 
     def pieces(
-        self, points: NDArray[np.floating], normals: NDArray[np.floating]
+        self, points: NDArray[np.floating], normals: NDArray[np.floating], rows: NDArray[np.intp]
     ) -> Iterator[tuple[NDArray[np.intp], Any]]:
-        """Yield the rows of each piece, and its values on the device, (ROWS, stride)."""
-        if not len(points):
+        """Yield some rows of points piece by piece, and the values of each on the device, (ROWS, stride)."""
+        if not len(rows):
             return
         resident, nk = self._resident, self._resident.volume.shape_ijk[2]
-        places, directions = self.frame.places(points), self.frame.directions(normals)
         least_gap = float(self.frame.gaps.min()) if nk > 1 else 1.0
         reach = int(np.ceil(-self.scale.first_mm / least_gap)) + 1 + self._cubic
-        piece = min(PIECE, len(points))
+        piece = min(PIECE, len(rows))
 
         def needs(slices: int) -> dict[str, int]:
             held_bytes = min(slices + 2 * reach + 1, nk) * resident.slice_bytes
@@ -340,42 +340,41 @@ class ProfileSampler:
             raise DeviceMemoryError(f"no profiles can be sampled: {describe_shortage(resident.limits, needs(1))}")
         if planned >= nk:
             voxels_d = resident.whole(self._stopwatch)
-            for begin in range(0, len(points), piece):
-                rows = np.arange(begin, min(begin + piece, len(points)))
-                yield rows, self._sample(voxels_d, 0, places, directions, rows)
+            for span in chunks(len(rows), piece):
+                yield rows[span], self._sample(voxels_d, 0, points[rows[span]], normals[rows[span]])
             return
+        layers = self.frame.places(points[rows])[3]
         for first in range(0, nk, planned):
             low, high = max(first - reach, 0), min(first + planned + reach + 1, nk)
-            rows_of_slab = np.flatnonzero((places[3] >= first) & (places[3] < first + planned))
-            if not len(rows_of_slab):
+            of_slab = rows[(layers >= first) & (layers < first + planned)]
+            if not len(of_slab):
                 continue
             voxels_d = resident.part(low, high, self._stopwatch)
-            for begin in range(0, len(rows_of_slab), piece):
-                rows = rows_of_slab[begin : begin + piece]
-                yield rows, self._sample(voxels_d, low, places, directions, rows)
+            for span in chunks(len(of_slab), piece):
+                yield of_slab[span], self._sample(voxels_d, low, points[of_slab[span]], normals[of_slab[span]])
             resident.volume.release_slices(low, high)
 
-    def _sample(
-        self, voxels_d: Any, first_k: int, places: Float32Array, directions: Float32Array, rows: NDArray[np.intp]
-    ) -> Any:
+    def _sample(self, voxels_d: Any, first_k: int, points: NDArray[np.floating], normals: NDArray[np.floating]) -> Any:
         device, (ni, nj, nk) = self.device, self._resident.volume.shape_ijk
-        stride, lanes = stride_of(len(rows)), int(device.kernel_variants["LANES"])
-        values_d, columns = allocate(device, 4 * ROWS * stride), np.pad(rows, (0, stride - len(rows)), mode="edge")
+        count, lanes = len(points), int(device.kernel_variants["LANES"])
+        stride = stride_of(count)
+        in_stack = (self.frame.places(points), self.frame.directions(normals))
+        places, directions = (np.pad(rows, ((0, 0), (0, stride - count)), mode="edge") for rows in in_stack)
+        values_d = allocate(device, 4 * ROWS * stride)
         launch(
-            device, self.program["sample_profiles"], -(-len(rows) // lanes), voxels=voxels_d,
-            slices=upload(device, self.frame.slices), places=upload(device, places.take(columns, axis=1)),
-            directions=upload(device, directions.take(columns, axis=1)), profiles=values_d,
+            device, self.program["sample_profiles"], -(-count // lanes), voxels=voxels_d,
+            slices=upload(device, self.frame.slices), places=upload(device, places),
+            directions=upload(device, directions), profiles=values_d,
             ni=ni, nj=nj, nk=nk, first_k=first_k, first_mm=self.scale.first_mm, step_mm=self.scale.step_mm,
             usual_gap=self.frame.usual_gap, i_square=self.frame.squares[0], j_square=self.frame.squares[1],
-            known_k=self._known_k,
-            stride=stride, count=len(rows),
+            known_k=self._known_k, stride=stride, count=count,
         )  # fmt: skip
         return values_d
 
     def values(self, points: NDArray[np.floating], normals: NDArray[np.floating]) -> Float32Array:
         """Return the profiles, shape (ROWS, n): HU, NaN beyond the volume, and what blurs them."""
         profile_values = np.empty((ROWS, len(points)), np.float32)
-        for rows, values_d in self.pieces(points, normals):
+        for rows, values_d in self.pieces(points, normals, np.arange(len(points))):
             stride = stride_of(len(rows))
             piece = download(self.device, np.empty((ROWS, stride), np.float32), values_d)
             profile_values[:, rows] = piece[:, : len(rows)]

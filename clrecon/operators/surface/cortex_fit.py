@@ -136,12 +136,12 @@ def fit_walls(
 
     def fit_pieces() -> Iterator[_Fitted]:
         for members, known in groups:
-            for piece, values_d in sampler.pieces(points[members], normals[members]):
+            for rows, values_d in sampler.pieces(points, normals, members):
                 with stopwatch.running(resident.device):
-                    profiles = WallProfiles(sampler, values_d, len(piece))
+                    profiles = WallProfiles(sampler, values_d, len(rows))
                     walls, frames = profiles.fit_with(known), profiles.frames()
                     denser = None if known.denser is None else profiles.fit_with(known.at_dense_end()).shift_mm
-                yield members[piece], known, walls, frames, denser
+                yield rows, known, walls, frames, denser
 
     def judge_piece(fitted: _Fitted) -> None:
         members, known, fits, frames, denser = fitted

@@ -32,7 +32,7 @@ from clrecon.operators.surface.cortex_fit import (
 )
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.light_dataclass import dataclass
-from clrecon.system.pieces import in_threads, spread_rows
+from clrecon.system.pieces import in_threads, side_by_side, spread_rows
 from clrecon.system.progress import Progress, Steps, ignore_progress
 from clrecon.system.records import Record
 
@@ -244,9 +244,11 @@ def fit_mesh(
 
     steps = Steps(progress, "cortex", 4)
     _refuse_few(mesh.vertex_count, mesh.vertex_count)
-    fans, normals = Fans(mesh.triangles, mesh.vertex_count), _normals_of(mesh)
+    normals = _normals_of(mesh)
     fit_along = partial(fit_walls, resident, mesh.vertices, stopwatch=Stopwatch(), components=_label(mesh, resident))
-    fit = fit_along(normals, constants=constants)
+    fans, fit = side_by_side(
+        partial(Fans, mesh.triangles, mesh.vertex_count), partial(fit_along, normals, constants=constants)
+    )
     _refuse_few(int(np.count_nonzero(fit.states == FITTED)), len(fit.states))
     steps.take()
     # Normals of steps are 30 to 40 degrees off: the fit is made again along those of the moved surface, as means over
@@ -268,9 +270,11 @@ def fit_mesh(
     )  # fmt: skip
     steps.take()
     moved = Mesh(vertices, mesh.triangles, vertex_normals(vertices, mesh.triangles), mesh.report)
-    np.hypot(fit.error_mm, _BENT_ERROR * fit.constants.blur_mm * measure_bends(moved, fans), out=fit.error_mm)
     fitted = fit.states == FITTED
-    unmoved = int(np.count_nonzero(fitted & (np.abs(vertices - wanted).max(axis=1) > KEPT_MM)))
+    rows = np.flatnonzero(fitted)
+    bent_mm = _BENT_ERROR * fit.constants.blur_mm * measure_bends(moved, fans, rows)
+    fit.error_mm[rows] = np.hypot(fit.error_mm[rows], bent_mm)
+    unmoved = int(np.count_nonzero(np.maximum.reduce(np.abs(vertices[rows] - wanted[rows]).T) > KEPT_MM))
     known = np.isin(fit.states, (FITTED, BADLY_FITTED))
     moved.report = {**mesh.report, "cortex": _describe_fit(fit, resident, mesh.vertices, normals, unmoved)}
     moved.values = {
@@ -281,11 +285,11 @@ def fit_mesh(
     return moved
 
 
-def measure_bends(mesh: Mesh, fans: Fans) -> NDArray[np.float32]:
-    """Return how much the normals around each vertex differ: the root of 1 less the length of their mean."""
+def measure_bends(mesh: Mesh, fans: Fans, rows: IntArray) -> NDArray[np.float32]:
+    """Return how much the normals around some vertices differ: the root of 1 less the length of their mean."""
     assert mesh.normals is not None
-    count = (fans.begin[1:] - fans.begin[:-1]).astype(np.float32)[:, None]
-    beside = fans.sums(mesh.normals, mesh.triangles, np.arange(len(count))) - count * mesh.normals
+    count = (fans.begin[rows + 1] - fans.begin[rows]).astype(np.float32)[:, None]
+    beside = fans.sums(mesh.normals, mesh.triangles, rows) - count * mesh.normals[rows]
     lengths = np.linalg.norm(beside, axis=1) / np.maximum(2.0 * count[:, 0], 1.0)
     return np.sqrt(np.maximum(1.0 - lengths, 0.0)).astype(np.float32)
 

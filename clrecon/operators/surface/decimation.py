@@ -17,7 +17,7 @@ from clrecon.operators.masks.voxel_mask import zero_words
 from clrecon.operators.surface.collapse import DeviceCollapser
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.light_dataclass import dataclass
-from clrecon.system.pieces import chunks, find_bounds, in_threads
+from clrecon.system.pieces import chunks, find_bounds, in_threads, list_distinct
 from clrecon.system.progress import Progress, Steps
 
 _FEWEST = 20_000
@@ -216,9 +216,12 @@ class CrossingMarks:
             if steps is not None:
                 ocl.wait(device)
                 steps.take(span.stop - span.start)
-        bits = np.unpackbits(ocl.download(device, marks, marks_d).view(np.uint8), axis=1, bitorder="little")
-        unsure, cut = (find_used(self._triangles[np.flatnonzero(row)], len(plan.triangles)) for row in bits)
-        return unsure, cut
+        marked = []
+        for words in ocl.download(device, marks, marks_d):
+            used = np.flatnonzero(words)
+            word, bit = np.nonzero(np.unpackbits(words[used].view(np.uint8), bitorder="little").reshape(-1, 32))
+            marked.append(list_distinct(self._triangles[32 * used[word] + bit]).astype(np.intp))
+        return marked[0], marked[1]
 
 
 def follow_crossings(

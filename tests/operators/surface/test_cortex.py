@@ -248,7 +248,7 @@ def test_cortex_fitted_in_slabs_is_that_of_the_whole(device, uneven, few, cubic)
 
     with DeviceVolume(volume, device=device, memory=memory) as resident:
         sampler = ProfileSampler(resident, Stopwatch(), cubic=cubic)
-        assert len(list(sampler.pieces(mesh.vertices, mesh.normals))) > 1
+        assert len(list(sampler.pieces(mesh.vertices, mesh.normals, np.arange(mesh.vertex_count)))) > 1
         slabs = fit_walls(
             resident, mesh.vertices, mesh.normals, stopwatch=Stopwatch(), constants=whole.constants, cubic=cubic
         )
