@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -39,8 +40,12 @@ def test_table_of_a_bench_names_scan_device_stages_kernels_and_peer(
     assert "17 slices of 31 x 25, spacing 0.8 x 1.1 x 1.5 mm" in out
     assert "-150 HU, open at the border" in out
     for words in (device.name, device.driver, "first surface", "later ones", "kernels", "flying edges", "ratio",
-                  "Mvoxel/s", "Mtriangle/s", "read"):  # fmt: skip
+                  "Mvoxel/s", "Mtriangle/s"):  # fmt: skip
         assert words in out
+    reading = re.search(r"^read +([\d.]+) (ms|s) \(([\d.]+) Mvoxel/s\)$", out, re.MULTILINE)
+    assert reading is not None
+    seconds = float(reading[1]) * {"s": 1.0, "ms": 1e-3}[reading[2]]
+    assert float(reading[3]) * seconds == pytest.approx(1e-6 * 17 * 31 * 25, rel=0.1)  # the rate has two digits
 
 
 def test_json_and_report_of_a_bench_have_the_names_of_the_contract_and_none_of_the_patient(

@@ -80,6 +80,16 @@ def test_completion_script_names_all_commands_and_options(shell: str, capsys: py
     assert printed.err == ""
 
 
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [("report", "-l report -r -d"), ("quiet", "-s q -l quiet -d"), ("preset", "-l preset -x -a 'bone")],
+    ids=["a value", "none", "a word of a list"],
+)
+def test_fish_offers_words_files_or_nothing_for_the_value_of_an_option(option: str, words: str) -> None:
+    of_mesh = [line for line in write_script("fish").splitlines() if "from mesh' " in line]
+    assert words in next(line for line in of_mesh if f"-l {option} " in line)
+
+
 @pytest.mark.parametrize("shell", SHELLS)
 def test_completion_script_is_sound_for_its_shell(shell: str) -> None:
     if not shutil.which(shell):

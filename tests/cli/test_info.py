@@ -313,6 +313,16 @@ def test_listing_for_a_terminal_leaves_columns_out_and_says_so_where_it_is_a_tab
     assert ("left out: a wider window" in " ".join(" ".join(lines).split())) == says_left_out
 
 
+def test_listing_shows_a_tilt_from_a_hundredth_of_a_degree_on(terminal: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal(200)
+    monkeypatch.setenv("NO_COLOR", "1")
+    entries = [make_entry(number, tilt_deg=tilt) for number, tilt in enumerate((0.04, 0.004), 1)]
+
+    lines = render_listing(make_listing(*entries), describe_certificate(None))
+
+    assert [word for line in lines[1:] for word in line.split() if word in ("+0.04", "+0.00")] == ["+0.04"]
+
+
 @pytest.mark.parametrize(("columns", "is_coloured"), [(200, True), (80, True), (60, False), (30, False)])
 def test_listing_for_a_terminal_is_coloured_where_it_is_a_table(
     columns: int, is_coloured: bool, terminal: Any, long_listing: dict[str, Any]
