@@ -145,7 +145,7 @@ PRESETS: dict[str, Preset] = {
         ),
         _preset(
             "vessels",
-            "vessels and organs with contrast medium in red, bone paler behind them; a table is visible too",
+            "vessels with contrast medium in red, and bone of the same HU: without contrast medium, red is bone",
             [
                 (120.0, _BLOOD, 0.0),
                 (170.0, (0.66, 0.10, 0.08), 0.04),

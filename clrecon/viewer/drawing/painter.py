@@ -56,9 +56,6 @@ SMALLEST_SIDE = 64
 
 _COARSE_STEP_VOXELS = 2.0
 
-MOST_FOUND = 6
-"""Sets of parts that are kept, of all views together."""
-
 
 def never() -> bool:
     return False
@@ -206,13 +203,12 @@ class Painter(Stage):
 
     def curve_picture(self, state: ViewState, size: Sequence[int]) -> Rendering:
         """Straighten the first scan along the curve of the tool, or the last one that was made."""
-        scan = next((each for each in self.objects if isinstance(each, ShownScan)), None)
-        if scan is None:
+        if not self.scans:
             raise UsageError("there is no scan: a picture along a curve needs one")
         if len(state.curve) < 2:
             raise UsageError("a picture along a curve needs two points and more: pick them with the tool curve")
         with self.lock:
-            renderer = self.renderer(self.resident(scan.number, state))
+            renderer = self.renderer(self.resident(self.scans[0].number, state))
             return renderer.render(CurveCut(list(state.curve), window=state.window), size=checked_size(size))
 
     def prepare(self, progress: Progress | None = None) -> None:
@@ -302,9 +298,7 @@ class Painter(Stage):
 
     def _sliced(self, state: ViewState) -> tuple[DeviceVolume, LabelledLook | None] | None:
         """Return the volume that slices are cut through: the first scan that is shown, else a label map."""
-        scans = [each for each in self.objects if isinstance(each, ShownScan)]
-        shown = [each for each in scans if (whole := state.whole(each.number)) is not None and whole.visible]
-        for scan in shown or scans:
+        for scan in self._shown_scans(state) or self.scans:
             return self.resident(scan.number, state), self.labelled(scan.number, state)
         for shown_object in self.objects:
             if isinstance(shown_object, ShownLabels):

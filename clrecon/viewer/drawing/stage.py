@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.anatomy.body import remove_table
+from clrecon.anatomy.noise import choose_smoothing
 from clrecon.errors import NoSurfaceError
 from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
@@ -18,6 +20,7 @@ from clrecon.labels.resample import ResampledLabels
 from clrecon.mesh import Mesh
 from clrecon.mesh.triangles import vertex_normals
 from clrecon.opencl import Device
+from clrecon.operators.filters.bilateral import filter_bilateral
 from clrecon.operators.rays.point_pictures import PointPictures
 from clrecon.operators.rays.scene import ScenePictures
 from clrecon.operators.rays.volume_renderer import VolumeRenderer
@@ -29,7 +32,7 @@ from clrecon.rendering.pictures.object_looks import MeshLook
 from clrecon.rendering.pictures.styles import PlaneCut, Style, SurfaceLook, VolumeLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.system.color_scale import ColorScale
-from clrecon.system.light_dataclass import dataclass
+from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import format_hu
 from clrecon.viewer.drawing.looks import LabelledLook
@@ -125,7 +128,7 @@ def _warm_scan(volume: Volume, device: Device, tell: Progress) -> None:
                     extractor.extract(level)
                 except NoSurfaceError:
                     pass
-        find_clusters(resident, 1, 200.0, True, tell)
+        find_clusters(resident, 1, 200.0, (True, 0.0), tell)
         for style in styles[3:]:
             tell("build", 0, 0)
             renderer.render(style, camera=camera, size=PICTURE, background="transparent")
@@ -183,6 +186,10 @@ MOST_FOUND, _MOST_FOUND_BYTES = 6, 1 << 29
 """Sets of parts kept, of all views together, and bytes of their label maps; two are kept whatever their size."""
 
 
+_ALL_HU = 1e4
+"""Differences of a bilateral filter that count: with all of them it is a Gaussian, of sheared and uneven slices too."""
+
+
 class Stage(DeviceWorker):
     """What is on the device; safe for several threads: `lock` is held while the device works for a view."""
 
@@ -190,15 +197,17 @@ class Stage(DeviceWorker):
         self, objects: Sequence[ShownObject], *, device: Device | str | int | None = None, memory: int | None = None
     ):
         self.objects = tuple(objects)
+        self.scans = [each for each in objects if isinstance(each, ShownScan)]
         super().__init__(device, memory)
         self.lock = threading.RLock()
         self._bare: dict[int, Volume] = {}
-        self._residents: dict[tuple[int, bool], DeviceVolume] = {}
+        self._residents: dict[tuple[int, bool, float], DeviceVolume] = {}
+        self._smoothing: float | None = None
         self._solid: dict[int, tuple[DeviceVolume, ResampledLabels]] = {}
         self._takers: dict[int, VolumeRenderer | PointPictures] = {}
-        self._found: OrderedDict[tuple[int, float, bool], FoundParts] = OrderedDict()
+        self._found: OrderedDict[tuple[int, float, tuple[bool, float]], FoundParts] = OrderedDict()
         self._blank: dict[int, LabelledLook] = {}
-        self._fits: OrderedDict[tuple[int, float, bool], FittedScan] = OrderedDict()
+        self._fits: OrderedDict[tuple[int, float, tuple[bool, float]], FittedScan] = OrderedDict()
 
     def close(self) -> None:
         with self.lock:
@@ -215,11 +224,11 @@ class Stage(DeviceWorker):
         """Find the parts of all scans without a label map at the iso value, or take those that were found before."""
         found_parts = []
         for scan in self._clustered():
-            key = (scan.number, state.iso_value, state.table)
+            key = (scan.number, state.iso_value, state.voxels)
             with self.lock:
                 known = self._found.get(key)
                 if known is None:
-                    resident = self._resident(scan, state.table)
+                    resident = self.resident(scan.number, state)
             if known is None:  # most of the time is numpy's: other pictures are taken meanwhile
                 known = find_clusters(resident, *key, progress, lock=self.lock)
             with self.lock:
@@ -246,9 +255,7 @@ class Stage(DeviceWorker):
     def remove_table(self, progress: Progress | None = None) -> dict[int, dict[str, Any]]:
         """Make the scans without table and blankets, once; returns what was taken from each, by number."""
         facts = {}
-        for scan in self.objects:
-            if not isinstance(scan, ShownScan):
-                continue
+        for scan in self.scans:
             if scan.number not in self._bare:
                 bare = remove_table(scan.volume, progress=progress)
                 with self.lock:
@@ -256,10 +263,32 @@ class Stage(DeviceWorker):
             facts[scan.number] = dict(self._bare[scan.number].report["remove_table"])
         return facts
 
+    def say_table(self) -> str | None:
+        """Return what was taken away with the tables, and the way back; None: next to nothing."""
+        facts = self.remove_table()
+        removed = [(facts[scan.number]["dense_voxels_removed"], scan.volume.spacing) for scan in self.scans]
+        ml = sum(voxels * math.prod(spacing) / 1000.0 for voxels, spacing in removed)
+        if ml < 0.5:
+            return None
+        return f"{ml:,.0f} ml of table and blankets taken away: look whether the body is whole (b: show them)"
+
     @property
     def knows_table(self) -> bool:
         """True once `remove_table` is done."""
-        return all(each.number in self._bare for each in self.objects if isinstance(each, ShownScan))
+        return all(each.number in self._bare for each in self.scans)
+
+    def find_smoothing(self) -> float:
+        """Return the standard deviation in mm of the Gaussian that takes the measured noise of the first scan."""
+        if self._smoothing is None:
+            self._smoothing = round(choose_smoothing(self.scans[0].volume), 2)
+        return self._smoothing
+
+    def smooth_scans(self, state: ViewState) -> float:
+        """Make the scans of a state smoothed, once; returns `find_smoothing`."""
+        mm = self.find_smoothing()
+        for scan in self.scans:
+            self.resident(scan.number, replace(state, smooth_mm=mm))
+        return mm
 
     # Surfaces fitted to the bone
 
@@ -332,10 +361,11 @@ class Stage(DeviceWorker):
         }
         return FittedScan((mesh, inner), (coarse, inner[rows]), scales)
 
-    def _fit_keys(self, state: ViewState) -> list[tuple[int, float, bool]]:
-        scans = [each for each in self.objects if isinstance(each, ShownScan)]
-        shown = [scan for scan in scans if (whole := state.whole(scan.number)) is not None and whole.visible]
-        return [(scan.number, state.iso_value, state.table) for scan in shown]
+    def _fit_keys(self, state: ViewState) -> list[tuple[int, float, tuple[bool, float]]]:
+        return [(scan.number, state.iso_value, state.voxels) for scan in self._shown_scans(state)]
+
+    def _shown_scans(self, state: ViewState) -> list[ShownScan]:
+        return [scan for scan in self.scans if (whole := state.whole(scan.number)) is not None and whole.visible]
 
     def _name(self, number: int) -> str:
         return next(each.name for each in self.objects if each.number == number)
@@ -343,13 +373,13 @@ class Stage(DeviceWorker):
     # What is drawn
 
     def resident(self, number: int, state: ViewState) -> DeviceVolume:
-        scan = next(each for each in self.objects if each.number == number and isinstance(each, ShownScan))
+        scan = next(each for each in self.scans if each.number == number)
         with self.lock:
-            return self._resident(scan, state.table)
+            return self._resident(scan, not state.table and number in self._bare, state.smooth_mm)
 
     def labelled(self, number: int, state: ViewState) -> LabelledLook | None:
         """Return the label map by which a scan is divided, None where its parts are not known."""
-        scan = next(each for each in self.objects if each.number == number and isinstance(each, ShownScan))
+        scan = next(each for each in self.scans if each.number == number)
         with self.lock:
             shown_map = self._map_of(scan.number)
             if shown_map is not None:
@@ -365,17 +395,20 @@ class Stage(DeviceWorker):
         return resident.bring(labelled.labels).voxels
 
     def _clustered(self) -> list[ShownScan]:
-        return [each for each in self.objects if isinstance(each, ShownScan) and self._map_of(each.number) is None]
+        return [each for each in self.scans if self._map_of(each.number) is None]
 
     def _map_of(self, scan: int) -> ShownLabels | None:
         return next((each for each in self.objects if isinstance(each, ShownLabels) and each.within == scan), None)
 
-    def _resident(self, scan: ShownScan, table: bool) -> DeviceVolume:
-        bare = not table and scan.number in self._bare
-        key = (scan.number, bare)
+    def _resident(self, scan: ShownScan, bare: bool, smooth_mm: float) -> DeviceVolume:
+        key = (scan.number, bare, smooth_mm)
         if key not in self._residents:
-            volume = self._bare[scan.number] if bare else scan.volume
-            self._residents[key] = DeviceVolume(volume, device=self._device, memory=self.memory)
+            if smooth_mm:
+                plain = self._resident(scan, bare, 0.0)
+                self._residents[key] = filter_bilateral(plain, sigma_mm=smooth_mm, sigma_hu=_ALL_HU)
+            else:
+                volume = self._bare[scan.number] if bare else scan.volume
+                self._residents[key] = DeviceVolume(volume, device=self._device, memory=self.memory)
         return self._residents[key]
 
     def renderer(self, resident: DeviceVolume) -> VolumeRenderer:
@@ -389,14 +422,13 @@ class Stage(DeviceWorker):
     def _found_for(self, scan: ShownScan, state: ViewState) -> FoundParts | None:
         if state.parts_at is None:
             return None
-        return self._found.get((scan.number, state.parts_at, state.parts_table))
+        return self._found.get((scan.number, state.parts_at, state.parts_voxels))
 
     def hu_at(self, point: Point) -> float | None:
         """Return the HU of the first scan, trilinear; None outside of it."""
-        scan = next((each for each in self.objects if isinstance(each, ShownScan)), None)
-        if scan is None:
+        if not self.scans:
             return None
-        volume = scan.volume
+        volume = self.scans[0].volume
         ijk = volume.lps_to_ijk([point])[0]
         last = np.array(volume.shape_ijk) - 1
         if (np.abs(ijk - 0.5 * last) > 0.5 * last + 0.51).any():  # places are rounded to 0.001 mm

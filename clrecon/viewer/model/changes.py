@@ -277,7 +277,7 @@ class ChangingView:
             index = next(place for place, each in enumerate(parts) if each.object == batch.scan and each.is_whole)
             parts[index + 1 : index + 1] = fresh
         self.state = replace(
-            self.state, parts=tuple(parts), parts_at=batches[0].iso_value, parts_table=batches[0].table
+            self.state, parts=tuple(parts), parts_at=batches[0].iso_value, parts_voxels=batches[0].shown
         )
         self.version += 1
 

@@ -68,6 +68,11 @@ _Item = TypeVar("_Item")
 _SLAB_MM, _MOST_SLAB_MM = 10.0, 100.0
 """Thickness of slices that a key makes thick, and the most."""
 
+_MOST_SMOOTH_MM = 20.0
+
+_FLAT = 0.1
+"""Share of the next longer side of what is shown below which the shortest makes it flat."""
+
 _BOX_SHARE = 0.5
 """Of what there is along each axis, in a clip box about the cross."""
 
@@ -103,7 +108,7 @@ class ViewModel(ChangingView):
             middle = scans[0].volume.ijk_to_lps(near_layers(scans[0].volume, middle))
         only_labels = not scans and any(isinstance(each, ShownLabels) for each in objects)
         first = ViewState(
-            camera=fit_camera(corners, "anterior", 1.0),
+            camera=fit_camera(corners, _first_side(np.ptp(corners, axis=0)), 1.0),
             mode="labels" if only_labels else "surface",
             iso_value=min(high, max(low, DEFAULT_ISO_VALUE)) if iso_value is None else iso_value,
             window=BONE_WINDOW,
@@ -207,6 +212,15 @@ class ViewModel(ChangingView):
         if not self.scans:
             raise UsageError("there is no scan: there is no table to take away")
         self._change("table", "the table", table=bool(shown))
+
+    def set_smooth(self, mm: float) -> None:
+        """Show scans smoothed by a Gaussian of this standard deviation in mm; 0: as they were read."""
+        (sigma,) = checked_numbers("the smoothing of scans", mm)
+        if not self.scans:
+            raise UsageError("there is no scan: scans alone are smoothed")
+        if not 0.0 <= sigma <= _MOST_SMOOTH_MM:
+            raise UsageError(f"scans are smoothed by 0 to {_MOST_SMOOTH_MM:g} mm, not {sigma:g} mm")
+        self._change("smooth", "the smoothing" if sigma else "the scan without its noise", smooth_mm=sigma)
 
     def check_fit(self) -> None:
         """Refuse to show a surface fitted to the bone where there is none."""
@@ -452,6 +466,10 @@ class ViewModel(ChangingView):
         elif together and mode.kind in ("volume", "slices") and len(self.scans) > 1:
             others = ", ".join(each.name for each in self.scans[1:])
             notes.append(f"one scan is shown in mode {mode.name}, {others} by the surface")
+        if state.smooth_mm:
+            notes.append(
+                f"scans are smoothed by {state.smooth_mm:g} mm; HU and measures are those of the scans as read"
+            )
         if self._is_edge_on(mode):
             notes.append("slices are hardly seen along their planes: turn the picture")
         return {
@@ -468,6 +486,7 @@ class ViewModel(ChangingView):
             "window": list(state.window),
             "picture_window": list(state.picture_window or mode.window or ()) or None,
             "table": state.table,
+            "smooth_mm": state.smooth_mm,
             "fitted": state.fitted if self.scans and mode.kind == "surface" else None,
             "occlusion": state.occlusion,
             "color_by": state.color_by,
@@ -512,7 +531,7 @@ class ViewModel(ChangingView):
         """True where the parts of the scans are those of the iso value and the table as they are now."""
         state = self.state
         divided = [each.within for each in self.label_maps]
-        is_new = state.parts_at == state.iso_value and state.parts_table == state.table
+        is_new = state.parts_at == state.iso_value and state.parts_voxels == state.voxels
         return is_new or all(each.number in divided for each in self.scans)
 
     def say_place(self, point: Sequence[float]) -> str:
@@ -531,6 +550,12 @@ class ViewModel(ChangingView):
         """Return the lowest and highest corner of the box around objects; by default the scans, if there are any."""
         corners = np.concatenate([each.corners for each in objects or self.scans or self.objects])
         return corners.min(axis=0), corners.max(axis=0)
+
+
+def _first_side(extent: Float64Array) -> str:
+    """Return the side from which a view begins: the front, or the face of slices so few that they are a line."""
+    least, next_least, _ = np.sort(extent)
+    return ("left", "anterior", "inferior")[int(np.argmin(extent))] if least < _FLAT * next_least else "anterior"
 
 
 def checked_slab(thickness: Any) -> float:

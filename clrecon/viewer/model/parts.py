@@ -63,7 +63,7 @@ class FoundParts:
 
     scan: int
     iso_value: float
-    table: bool
+    shown: tuple[bool, float]
     volume: Volume
     labels: LabelMap
     placed: ResampledLabels
@@ -119,12 +119,15 @@ def find_clusters(
     resident: DeviceVolume,
     scan: int,
     iso_value: float,
-    table: bool,
+    shown: tuple[bool, float],
     progress: Progress | None = None,
     *,
     lock: AbstractContextManager[Any] | None = None,
 ) -> FoundParts:
-    """Find the parts of a scan, voxels at the iso value and above; `lock` is held while the device works."""
+    """Find the parts of a scan, voxels at the iso value and above; `lock` is held while the device works.
+
+    shown: Which voxels of the scan `resident` holds, see `ViewState.voxels`.
+    """
     tell, volume = progress or ignore_progress, resident.volume
     tell("parts", 0, STEPS)
     with lock or nullcontext():
@@ -145,7 +148,7 @@ def find_clusters(
     labels = ClusterMap(voxels, volume)
     tell("parts", STEPS, STEPS)
     return FoundParts(
-        scan=scan, iso_value=iso_value, table=table, volume=volume, labels=labels,
+        scan=scan, iso_value=iso_value, shown=shown, volume=volume, labels=labels,
         placed=ResampledLabels(labels.voxels, True, {}, ()), parts=parts,
         small_count=max(0, len(sizes) - _MOST_CLUSTERS),
     )  # fmt: skip

@@ -39,6 +39,7 @@ def encode_view(state: ViewState, objects: Sequence[ShownObject]) -> bytes:
         "window_hu": list(state.window),
         "picture_window_hu": None if state.picture_window is None else list(state.picture_window),
         "table_shown": state.table,
+        "smooth_mm": state.smooth_mm,
         "fitted": state.fitted,
         "occlusion": state.occlusion,
         "color_by": state.color_by,
@@ -195,6 +196,7 @@ def _apply(saved: Mapping[str, Any], trial: ViewModel) -> None:
     if trial.scans:
         trial.set_iso(saved["iso_value_hu"])
         trial.set_table(saved["table_shown"])
+        trial.set_smooth(saved.get("smooth_mm", 0.0))
         trial.set_occlusion(saved["occlusion"])
     if saved["picture_window_hu"] is not None:
         low, high = saved["picture_window_hu"]

@@ -173,6 +173,7 @@ class ViewState:
     window: HU shown as black and white in slices.
     picture_window: The same in projections; None: that of the mode.
     table: Table and blankets are shown.
+    smooth_mm: Standard deviation of the Gaussian that scans are smoothed by; 0: they are as they were read.
     fitted: The surfaces of scans lie where they were fitted to the bone, in the mode "surface".
     occlusion: Hollows of volume rendering and of surfaces at the iso value are darker (ambient occlusion).
     color_by: Number at the vertices of fitted surfaces that their colours show, one of `FIT_COLORS`.
@@ -184,7 +185,7 @@ class ViewState:
         others right of it.  None: all are shown together.
     frames: Of the slices that were zoomed or shifted; the others fit.
     parts_at: Iso value of the clusters; None: they are not known.
-    parts_table: Of which volume, see `table`.
+    parts_voxels: Of which voxels, see `voxels`.
     points: Points of the tool that is used.
     """
 
@@ -201,12 +202,13 @@ class ViewState:
     frames: tuple[SliceFrame, ...] = ()
     picture_window: tuple[float, float] | None = None
     table: bool = True
+    smooth_mm: float = 0.0
     fitted: bool = False
     occlusion: bool = False
     color_by: str | None = None
     parts: tuple[ShownPart, ...] = ()
     parts_at: float | None = None
-    parts_table: bool = True
+    parts_voxels: tuple[bool, float] = (True, 0.0)
     tool: str | None = None
     points: tuple[Pick, ...] = ()
     measures: tuple[Measure, ...] = ()
@@ -220,6 +222,11 @@ class ViewState:
         if self.clip_box is not None:
             clip = clip & Clip.box(*self.clip_box)
         return clip if len(clip.planes) else None
+
+    @property
+    def voxels(self) -> tuple[bool, float]:
+        """Which voxels of the scans are shown."""
+        return self.table, self.smooth_mm
 
     @property
     def curve(self) -> tuple[Point, ...]:
@@ -264,11 +271,11 @@ VIEWS = (SCENE, *SLICES, "curve")
 def picture_key(state: ViewState, view: str) -> Hashable:
     """Return what the picture of a view depends on: equal keys, equal pictures."""
     looks = tuple(part for part in state.parts if not part.is_plain)  # the others are drawn as if they were not known
-    parts = (looks, (state.parts_at, state.parts_table) if looks else None)
+    parts = (looks, (state.parts_at, state.parts_voxels) if looks else None)
     if view == SCENE:
         cut = (state.clips, state.clip_box)
         return (
-            *(state.camera, state.mode, state.iso_value, state.picture_window, state.table),
+            *(state.camera, state.mode, state.iso_value, state.picture_window, state.voxels),
             *(state.fitted, state.color_by, parts, cut, state.compare, state.occlusion),
         )
     if view in SLICES:
@@ -279,8 +286,8 @@ def picture_key(state: ViewState, view: str) -> Hashable:
             state.window,
             state.slab_mm,
             state.combine,
-            state.table,
+            state.voxels,
             parts,
             state.compare,
         )
-    return (state.curve, state.window, state.table)
+    return (state.curve, state.window, state.voxels)

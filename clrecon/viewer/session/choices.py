@@ -32,6 +32,9 @@ from clrecon.viewer.model.saved_view import VIEW_FORMAT
 _THUMBNAIL = 160
 """Pixels of the longer side."""
 
+_LEAST_SPREAD, _ENDS = 0.1, (0.5, 99.5)
+"""Share of the window that lies between these percentiles of a thumbnail; below it they are its window."""
+
 _LARGEST_GRID = 256 << 20
 """Bytes of a file with a grid that is read for its thumbnail."""
 
@@ -183,14 +186,24 @@ def _draw_series(root: Path, selection: Selection, progress: Progress) -> str:
 
 
 def draw_thumbnail(volume: Volume) -> str:
-    """Return the middle slice of a volume in the window of soft tissue, or of labels, as an address with its data."""
+    """Return a slice of a volume in the window of soft tissue, or of labels, as an address with its data.
+
+    The middle one, or if that has one value the one of widest range.  A flat slice is shown in a window of its own.
+    """
     load_pillow()
     from PIL import Image
 
     low, high = WINDOWS["soft"]
     if volume.voxels.min() >= 0:  # labels, or no HU
         low, high = 0.0, max(1.0, float(volume.voxels.max()))
-    layer = volume.voxels[volume.shape_ijk[2] // 2].astype(np.float64)
+    layer = volume.voxels[volume.shape_ijk[2] // 2]
+    if layer.min() == layer.max():
+        layer = max(volume.voxels, key=np.ptp)
+    layer = np.nan_to_num(layer.astype(np.float64), nan=low, posinf=high, neginf=low)
+    if np.ptp(np.percentile(layer.clip(low, high), _ENDS)) < _LEAST_SPREAD * (high - low):
+        low, high = np.percentile(layer, _ENDS)
+        if low == high:
+            low, high = layer.min() - 1.0, layer.max() + 1.0
     grey = np.clip((layer - low) * (255.0 / (high - low)), 0.0, 255.0).astype(np.uint8)
     mm = np.linalg.norm(volume.affine[:3, :2], axis=0) * volume.shape_ijk[:2]
     size = np.maximum(1, np.rint(_THUMBNAIL * mm / mm.max())).astype(int)

@@ -107,6 +107,8 @@ _model("set_occlusion", "darken hollows of scans, or not", "set_occlusion", on=_
 _model("toggle_occlusion", "darken hollows of scans, or not any more", "toggle_occlusion")
 _session("set_table", "show or take away table and blankets", "set_table", shown=_flag)
 _session("toggle_table", "take table and blankets away, or show them", "toggle_table")
+_session("set_smooth", "smooth scans against their noise, or show them as read", "set_smooth", on=_flag)
+_session("toggle_smooth", "smooth scans against their noise, or show them as read", "toggle_smooth")
 _session("set_fitted", "show surfaces fitted to the bone, or at the iso value", "set_fitted", shown=_flag)
 _session("toggle_fitted", "fit surfaces to the bone, or stop that, or show them at the iso value", "toggle_fitted")
 _model("set_color_by", "colour fitted surfaces by thickness or error; null: not", "set_color_by", name=_or_none(_text))
@@ -231,6 +233,7 @@ _SECTIONS: dict[str, dict[str, Key]] = {
         "o": Key("next mode; O: the one before", {"do": "step_mode", "steps": 1}),
         "O": Key("", {"do": "step_mode", "steps": -1}),
         "b": Key("table and blankets away, or shown", {"do": "toggle_table"}),
+        "y": Key("smoothed against noise, or as read", {"do": "toggle_smooth"}),
         "w": Key("hollows darker, or as light as all", {"do": "toggle_occlusion"}),
         "t": Key("surface fitted to the bone, or at the iso value", {"do": "toggle_fitted"}),
         "T": Key("fitted surface: thickness of the walls, error, plain", {"do": "step_color_by"}),

@@ -66,6 +66,7 @@ _WORDS = {
     "prepare": "building kernels",
     "parts": "finding parts",
     "table": "taking the table away",
+    "smooth": "smoothing the scan",
     "fit": "fitting the surface to the bone",
     "spine": "finding the spine",
     "coarse": "making coarse meshes",
@@ -232,6 +233,7 @@ class ViewSession(Closing):
                 "seen_lines": self._seen_lines(),
                 "scale": self._describe_scale(),
                 "offset": self.painter.find_offset(self.model.state),
+                "advice": self._advise(),
                 "busy": [_WORDS.get(kind, kind) for kind in self._work.busy],
                 "error": self._error,
                 "said": self._said,
@@ -289,7 +291,8 @@ class ViewSession(Closing):
         if count < _MANY_SMALL or self._warned_of_specks:
             return
         self._warned_of_specks = True
-        specks = f"{count:,} small parts, most likely noise (n: hide them)"
+        mm = self.painter.find_smoothing()
+        specks = f"{count:,} small parts, most likely noise (n: hide them; y: smooth the scan by {mm:g} mm)"
         self._said = specks if self._said is None else f"{specks}; {self._said}"
 
     def set_table(self, shown: bool) -> None:
@@ -314,16 +317,36 @@ class ViewSession(Closing):
         """Begin with the bone by volume rendering; `bare`: the painter took the table away, and its share is said."""
         with self._lock:
             self.model.begin_with_bone(bare=bare)
-            self._said = self._say_table() if bare else None
+            self._said = self.painter.say_table() if bare else None
 
-    def _say_table(self) -> str | None:
-        """Return what was taken away with the tables, and the way back; None: next to nothing."""
-        facts = self.painter.remove_table()
-        removed = [(facts[scan.number]["dense_voxels_removed"], scan.volume.spacing) for scan in self.model.scans]
-        ml = sum(voxels * math.prod(spacing) / 1000.0 for voxels, spacing in removed)
-        if ml < 0.5:
-            return None
-        return f"{ml:,.0f} ml of table and blankets taken away: look whether the body is whole (b: show them)"
+    def set_smooth(self, on: bool) -> None:
+        """Smooth scans against their noise, which takes a moment the first time, or show them as they were read."""
+        self._work.cancel("smooth")
+        if not on or not self.model.scans:
+            self.model.set_smooth(0.0)
+            self._said = None
+            return
+
+        def smooth(job: Job) -> None:
+            mm = self.painter.smooth_scans(self.model.state)
+            with self._lock:
+                if not job.cancelled():
+                    self.model.set_smooth(mm)
+                    self._said = f"smoothed by a Gaussian of {mm:g} mm (y: as read)"
+                    self.rest()
+            self._changed()
+
+        self._work.ask("smooth", smooth, rank=3)
+
+    def toggle_smooth(self) -> None:
+        self.set_smooth(not (self.model.state.smooth_mm or "smooth" in self._work.busy))
+
+    def _advise(self) -> dict[str, str] | None:
+        """Return the step against noise that one click takes, for JSON, or the way back; None: there is no need."""
+        words = "show as read" if self.model.state.smooth_mm else None
+        if words is None and self._warned_of_specks:
+            words = f"smooth by {self.painter.find_smoothing():g} mm"
+        return None if words is None else {"words": words, "do": "toggle_smooth"}
 
     def toggle_table(self) -> None:
         self.set_table(not self.model.state.table)
@@ -331,7 +354,7 @@ class ViewSession(Closing):
     def _apply_table(self, shown: bool) -> None:
         self.model.set_table(shown)
         if not shown:
-            self._said = self._say_table() or "there is no table to take away, and no blankets"
+            self._said = self.painter.say_table() or "there is no table to take away, and no blankets"
         self.rest()
 
     def set_fitted(self, shown: bool) -> None:

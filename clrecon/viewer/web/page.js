@@ -228,7 +228,7 @@
   function takeFacts(changed) {
     const before = facts, now = facts = { ...before, ...changed }, told = (name) => name in changed;
     if (now.tool !== choosing && !["only", "hide"].includes(choosing)) choosing = now.tool || "";
-    for (const id of ["iso", "tabled", "hollowed", "layouts", "spine", "windows"]) find(id).hidden = !now.iso;
+    for (const id of ["iso", "tabled", "smoothed", "hollowed", "layouts", "spine", "windows"]) find(id).hidden = !now.iso;
     find("modes").hidden = find("modewords").hidden = now.modes.length < 2;
     if (told("iso") && now.iso) showIso();
     if (told("modes")) showModes();
@@ -241,6 +241,9 @@
       tell("thumbnails");
     }
     find("table").checked = now.table;
+    find("smooth").checked = now.smooth_mm > 0;
+    find("advice").hidden = !now.advice;
+    if (now.advice) Object.assign(find("advice"), { textContent: now.advice.words, onclick: () => run(now.advice.do) });
     find("fitting").hidden = now.fitted === null;
     find("fitted").checked = Boolean(now.fitted);
     find("shade").hidden = !now.fitted;
@@ -510,6 +513,7 @@
   find("spine").onclick = () => run("find_spine");
   for (const button of find("layouts").children) button.onclick = () => run("set_layout", { name: button.dataset.layout });
   find("table").onchange = () => run("set_table", { shown: find("table").checked });
+  find("smooth").onchange = () => run("set_smooth", { on: find("smooth").checked });
   find("fitted").onchange = () => run("set_fitted", { shown: find("fitted").checked });
   find("shade").onchange = () => run("set_color_by", { name: find("shade").value || null });
   find("perspective").onchange = () => run("set_perspective", { on: find("perspective").checked });
@@ -543,23 +547,14 @@
   const aimed = () => Object.values(views).find(({ box }) => box.matches(":focus-visible"))
     || Object.values(views).find(({ pointer }) => pointer);
 
-  function scrollAimed(steps) {
+  const onAimed = (noun, fits) => (act) => () => {
     const view = aimed();
-    if (view && SLICES.includes(view.name)) scrollBy(view, steps);
-    else hint("Point at a slice first.");
-  }
-
-  function turnAimed(degrees) {
-    const view = aimed();
-    if (view && SLICES.includes(view.name)) run("turn_cross", { plane: view.name, degrees });
-    else hint("Point at a slice first.");
-  }
-
-  function zoomAimed(factor) {
-    const view = aimed();
-    if (view && view.name !== "curve") zoomBy(view, factor, ...middleOf(view));
-    else hint("Point at a picture first.");
-  }
+    if (view && fits(view.name)) act(view);
+    else hint(`Point at a ${noun} first.`);
+  };
+  const onSlice = onAimed("slice", (name) => SLICES.includes(name)), onPicture = onAimed("picture", (name) => name !== "curve");
+  const turnBy = (degrees) => onSlice((view) => run("turn_cross", { plane: view.name, degrees }));
+  const enlargeBy = (factor) => onPicture((view) => zoomBy(view, factor, ...middleOf(view)));
 
   // What the page does itself at a key; what else keys do are commands of the session.
   const press = (id) => () => { if (!find(id).hidden) find(id).click(); };
@@ -569,12 +564,8 @@
     escape: () => { if (choosing) choose(""); else { run("cancel"); run("dismiss"); hint(""); } },
     quit: () => tell("quit"),
     full: () => setFull((aimed() || views.scene).name),
-    before: () => scrollAimed(-1),
-    behind: () => scrollAimed(1),
-    larger: () => zoomAimed(1.25),
-    smaller: () => zoomAimed(0.8),
-    turn_left: () => turnAimed(-TURN_DEGREES),
-    turn_right: () => turnAimed(TURN_DEGREES),
+    before: onSlice((view) => scrollBy(view, -1)), behind: onSlice((view) => scrollBy(view, 1)),
+    larger: enlargeBy(1.25), smaller: enlargeBy(0.8), turn_left: turnBy(-TURN_DEGREES), turn_right: turnBy(TURN_DEGREES),
   };
 
   // A command for what lies under the pointer; elsewhere what is like it for the part that was chosen in the list.

@@ -96,6 +96,7 @@ CHANGES = {
     "projection": show_projection,
     "fitted surface": show_fit,
     "looks of parts": change_looks,
+    "smoothing": lambda model: model.set_smooth(0.9),
     "table": lambda model: model.set_table(shown=False),
 }
 

@@ -13,6 +13,7 @@ from refusals import refused
 from view_models import make_model
 
 from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.geometry import Volume
 from clrecon.labels.resample import ResampledLabels
 from clrecon.points import PointCloud
 from clrecon.viewer.drawing.painter import Painter
@@ -38,7 +39,7 @@ def make_parts(*, iso: float = 300.0) -> FoundParts:
     )  # fmt: skip
     placed = ResampledLabels(labels.voxels, exact=True, inside={}, warnings=())
     return FoundParts(
-        scan=1, iso_value=iso, table=True, volume=volume, labels=labels, placed=placed, parts=parts
+        scan=1, iso_value=iso, shown=(True, 0.0), volume=volume, labels=labels, placed=placed, parts=parts
     )  # fmt: skip
 
 
@@ -195,6 +196,17 @@ def test_facts_name_a_mesh_that_the_mode_does_not_show():
     model = make_model(scenes.make_scan(), scenes.make_mesh())
     model.set_mode("mip")
     assert "mesh 2" in model.facts()["notes"][0]
+
+
+@pytest.mark.parametrize(
+    ("shape", "forward"),
+    [((40, 40, 40), (0, 1, 0)), ((3, 40, 40), (0, 0, 1)), ((40, 40, 3), (-1, 0, 0)), ((40, 3, 40), (0, 1, 0))],
+    ids=["cube", "axial slices", "sagittal slices", "coronal slices"],
+)
+def test_view_begins_at_the_front_and_of_a_few_slices_at_their_face(shape, forward):
+    model = ViewModel(show_objects([Volume(np.zeros(shape, np.int16), np.eye(4))]))
+
+    assert model.camera.basis().forward == pytest.approx(forward)
 
 
 def test_view_of_a_mesh_alone_has_one_mode_and_no_iso_value():
@@ -445,5 +457,5 @@ def test_progress_of_the_search_for_parts_names_each_step(monkeypatch):
     monkeypatch.setattr(parts.Mask, "from_band", find_nothing)
     told = []
     resident = SimpleNamespace(volume=scenes.make_scan())
-    parts.find_clusters(resident, scan=1, iso_value=300.0, table=True, progress=lambda *step: told.append(step))
+    parts.find_clusters(resident, scan=1, iso_value=300.0, shown=(True, 0.0), progress=lambda *step: told.append(step))
     assert told == [("parts", done, parts.STEPS) for done in range(parts.STEPS + 1)]

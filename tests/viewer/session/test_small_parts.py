@@ -44,6 +44,29 @@ def test_a_thousand_parts_beside_the_twenty_largest_are_said_to_be_noise(open_se
     assert ("1,000 small parts" in (view.facts()["said"] or "")) == is_said
 
 
+def test_noisy_scan_is_smoothed_by_the_step_that_the_hint_offers_and_shown_as_read_again(open_session):
+    view = open_session(specks(20 + 1_000))
+    find_parts(view)
+    offered = view.facts()["advice"]
+
+    view.do({"do": offered["do"]})
+    assert view.wait(PATIENCE_S)
+    find_parts(view)
+    smoothed = view.facts()
+    back = view.do({"do": smoothed["advice"]["do"]})
+
+    assert offered["words"] == "smooth by 1 mm"  # a voxel: there is no soft tissue in which noise could be measured
+    assert (smoothed["smooth_mm"], [part["kind"] for part in smoothed["parts"]]) == (1.0, ["scan", "rest"])
+    assert (back["smooth_mm"], back["advice"]) == (0.0, offered)
+
+
+def test_step_against_noise_is_offered_for_no_scan_of_few_parts(open_session):
+    view = open_session(specks(50))
+    find_parts(view)
+
+    assert view.facts()["advice"] is None
+
+
 def test_small_parts_are_hidden_together_and_shown_again(open_session):
     view = open_session(specks(50))
     find_parts(view)

@@ -119,8 +119,8 @@ RIGHT: dict[str, dict[str, Any]] = {
 
 @pytest.mark.opencl
 def test_each_command_is_done_and_what_it_changes_is_undone(open_session):
-    own_tests = "save find_spine toggle_small_parts set_compare toggle_compare set_occlusion toggle_occlusion".split()
-    assert {*RIGHT, *own_tests} == set(COMMANDS)
+    toggles = {f"{verb}_{name}" for verb in ("set", "toggle") for name in ("compare", "occlusion", "smooth")}
+    assert {*RIGHT, *toggles, "save", "find_spine", "toggle_small_parts"} == set(COMMANDS)
     view = open_session()
     view.do({"do": "find_parts"})
     assert view.wait(PATIENCE)

@@ -46,6 +46,8 @@ CONTROLS = {
     ),
     "#modes [data-mode='mip']": Control("f.mode === 'mip'"),
     "#table": Control("!f.table", before=(("set_iso", {"hu": 300}), SURFACE, ("set_table", {"shown": True}))),
+    "#smooth": Control("f.smooth_mm > 0", before=(("set_smooth", {"on": False}),)),
+    "#advice": Control("f.smooth_mm === 0", before=(("set_smooth", {"on": True}),)),
     "#occlusion": Control("f.occlusion"),
     "#perspective": Control("!f.camera.parallel"),
     "#fitted": Control("f.fitted", before=(SURFACE, ("set_fitted", {"shown": False}))),

@@ -17,7 +17,7 @@ SCRIPT = "".join((files("clrecon.viewer.web") / name).read_text(encoding="utf-8"
 
 def test_keys_that_are_no_commands_are_what_the_page_does_itself() -> None:
     (block,) = re.findall(r"const OWN = \{(.*?)\n  \};", SCRIPT, re.DOTALL)
-    own = set(re.findall(r"(?<![\w.])(\w+): (?:press|\(\))", block))
+    own = set(re.findall(r"(?<![\w.])(\w+): (?:press|onSlice|enlargeBy|turnBy|\(\))", block))
 
     assert own == {key.does for key in KEYS.values() if isinstance(key.does, str)}
 

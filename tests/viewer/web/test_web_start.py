@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import base64
 import http.client
+import io
 import json
 import shutil
 import socket
@@ -18,16 +20,19 @@ import pytest
 import view_scenes as scenes
 from browser import severe_lines, wait_for
 from dicom_series import Plan, write_series
+from PIL import Image
 from refusals import refused
 from web_views import PATIENCE, browsing, get_path, secret_of, serving
 
 from clrecon.errors import UsageError
+from clrecon.geometry import Volume
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.view import ViewSettings
 from clrecon.reading.grids.write_volume import write_volume
 from clrecon.viewer.model.model import ViewModel
 from clrecon.viewer.model.objects import show_objects
 from clrecon.viewer.model.saved_view import encode_view
+from clrecon.viewer.session.choices import draw_thumbnail
 from clrecon.viewer.web.server import WebServer
 from clrecon.viewer.web.start_page import Limits, StartRoom
 
@@ -231,6 +236,44 @@ def test_series_is_listed_with_its_size_and_a_picture(large_dropper: Dropper, tm
     assert choice["words"] == "7 slices · 40 × 30 · 0.5 × 0.7 × 1.25 mm"
     assert choice["thumbnail"].startswith("data:image/jpeg;base64,")
     assert (choice["button"], choice["is_refused"]) == ("Open", False)
+
+
+FLAT = {
+    "low contrast below the window": np.linspace(-1000, -900, 1600),
+    "above the window": np.linspace(900, 1000, 1600),
+    "one value": np.full(1600, -700),
+    "one value of 0": np.zeros(1600),
+}
+
+
+@pytest.mark.parametrize("values", FLAT.values(), ids=FLAT)
+def test_thumbnail_of_a_flat_scan_is_neither_black_nor_white(values: np.ndarray) -> None:
+    slices = np.tile(values.reshape(40, 40).astype(np.int16), (3, 1, 1))
+
+    picture = draw_thumbnail(Volume(slices, np.eye(4)))
+
+    grey = np.asarray(Image.open(io.BytesIO(base64.b64decode(picture.partition(",")[2]))))
+    assert 100 < grey.mean() < 155  # of 0 to 255: around the middle
+
+
+def test_thumbnail_of_a_few_voxels_of_a_label_beside_the_middle_slice_shows_them() -> None:
+    slices = np.zeros((5, 40, 40), np.uint8)
+    slices[1, 20:22, 20:22] = 3
+
+    picture = draw_thumbnail(Volume(slices, np.eye(4)))
+
+    grey = np.asarray(Image.open(io.BytesIO(base64.b64decode(picture.partition(",")[2])))).astype(int)
+    assert grey[84, 84] - grey[10, 10] > 100  # four pixels of the picture to a voxel
+
+
+def test_thumbnail_of_soft_tissue_keeps_its_window() -> None:
+    slices = np.full((3, 40, 40), -1000, np.int16)
+    slices[:, :, 20:] = 50
+
+    picture = draw_thumbnail(Volume(slices, np.eye(4)))
+
+    grey = np.asarray(Image.open(io.BytesIO(base64.b64decode(picture.partition(",")[2]))))
+    assert abs(int(grey[20, 10])) < 8 and abs(int(grey[20, 150]) - 127) < 8  # 50 HU of -150 to 250; JPEG
 
 
 def test_series_with_a_gap_is_offered_with_the_gap_and_the_reason(large_dropper: Dropper, tmp_path: Path) -> None:
