@@ -21,7 +21,7 @@ from clrecon.mesh.compare.distances import (
     sample_surface,
     summarise_distances,
 )
-from clrecon.mesh.connectivity import IntArray, Topology, find_edges, opposite_half_edges
+from clrecon.mesh.connectivity import IntArray, Topology, find_edges, number_used, opposite_half_edges
 from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.quality import MeshQuality, TriangleSums, survey_surface
 from clrecon.mesh.triangle_tree import TriangleTree
@@ -35,7 +35,7 @@ from clrecon.system.records import Record
 _AT_CORNER = 1e-6
 """Share of a triangle within which the nearest point counts as on its edge or at its corner."""
 
-_PIECE = 1 << 14
+_PIECE = 1 << 16
 """Points between two calls of `progress`."""
 
 
@@ -68,7 +68,6 @@ class SignedDistance:
         self._tree = TriangleTree(vertices - self._origin, triangles)
         self._sign = 1.0 if outward else -1.0
         self._opposite = opposite
-        self._corners = vertex_normals(vertices, triangles).astype(np.float64)
 
     def __call__(self, points: Points) -> NDArray[np.float64]:
         """Distances in mm, shape (k,), from `points`, shape (k, 3), mm; positive outside."""
@@ -109,8 +108,16 @@ class SignedDistance:
         normals[on_edge] += self._normals_of(self._opposite[3 * rows[on_edge] + half] // 3)
         at_corner = np.flatnonzero(count >= 2)
         corner = self._triangles[rows[at_corner], near[at_corner].argmin(axis=1)]
-        normals[at_corner] = self._corners[corner]
+        normals[at_corner] = self._normals_around(corner)
         return np.asarray(normals)
+
+    def _normals_around(self, corners: NDArray[np.integer]) -> Points:
+        """Return pseudonormals at vertices, (k, 3), from the triangles around these alone."""
+        wanted = np.zeros(len(self._vertices), dtype=bool)
+        wanted[corners] = True
+        a, b, c = (wanted[corner] for corner in self._triangles.T)
+        used, triangles = number_used(self._triangles[a | b | c], len(wanted))
+        return vertex_normals(self._vertices[used], triangles)[np.searchsorted(used, corners)].astype(np.float64)
 
 
 @dataclass(frozen=True, eq=False)
