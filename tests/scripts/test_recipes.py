@@ -28,9 +28,16 @@ def find_kubernetes_command() -> str:
     return " ".join(folded.split()).replace("cd /data && ", "")
 
 
+def find_nextflow_command() -> str:
+    """Return the script of a part as bash gets it, but for its variables, which Nextflow puts in before."""
+    script = find_recipe("groovy", "process part").partition('script:\n    "')[2].partition('"\n')[0]
+    return script.replace("$base/", "").replace("\\$", "$")
+
+
 SHELL_RECIPES = {
     "Slurm": (find_recipe("bash", "#SBATCH"), {"SLURM_ARRAY_TASK_ID": "7", "SLURM_ARRAY_TASK_COUNT": "40"}),
     "Kubernetes": (find_kubernetes_command(), {"JOB_COMPLETION_INDEX": "6"}),
+    "Nextflow": (find_nextflow_command(), {"i": "7"}),
 }
 
 
