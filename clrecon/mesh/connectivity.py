@@ -113,17 +113,23 @@ def _index_type(size: int) -> type[np.integer]:
 def order_by_number(numbers: IntArray, size: int) -> IntArray:
     """Return the stable order of whole numbers from 0 to ``size - 1``, like ``argsort(kind="stable")``.
 
-    Converting a sparse matrix from rows to columns is a counting sort: linear in time, and on meshes, whose numbers are
-    mostly in order already, several times as fast as sorting by comparison.
+    Numbers of 16 bits are sorted by counting: the upper bits first, then the lower within each value of the upper.
     """
     count = len(numbers)
-    if size > 8 * count + 1024:  # counting would waste time on numbers that do not occur
+    if size > min(8 * count + 1024, 1 << 32):  # counting would waste time on numbers that do not occur
         return np.argsort(numbers, kind="stable")
-    from scipy.sparse import csr_array
+    lower, upper = numbers.astype(np.uint16), (numbers >> 16).astype(np.uint16)
+    if size <= 1 << 16:
+        return np.argsort(lower, kind="stable").astype(_index_type(count))
+    order = np.argsort(upper, kind="stable").astype(_index_type(count))
+    ends = np.cumsum(np.bincount(upper))
 
-    kind = _index_type(max(count, size) + 1)
-    here = np.arange(count + 1, dtype=kind)
-    return csr_array((here[:-1], numbers.astype(kind), here), shape=(count, size)).tocsc().data
+    def sort_lower(values: slice) -> None:
+        span = slice(ends[values.start - 1] if values.start else 0, ends[values.start])
+        order[span] = order[span].take(np.argsort(lower.take(order[span]), kind="stable"))
+
+    in_threads(sort_lower, len(ends), 1)
+    return order
 
 
 def find_used(numbers: IntArray, size: int) -> IntArray:

@@ -236,9 +236,11 @@ def test_an_empty_mesh_has_no_shortest_edge():
     assert measure(([], []))["shortest_edge_mm"] is None
 
 
-@pytest.mark.parametrize("limit", [1, 40, 100_000], ids=["all equal", "many equal", "few equal"])
+@pytest.mark.parametrize(
+    "limit", [1, 40, 100_000, 1_000_000], ids=["all equal", "many equal", "of 17 bits", "few equal"]
+)
 def test_order_by_number_is_a_stable_sort(limit):
-    numbers = np.random.default_rng(limit).integers(0, limit, 300)
+    numbers = np.random.default_rng(limit).integers(0, limit, 20_000)
     np.testing.assert_array_equal(order_by_number(numbers, limit), np.argsort(numbers, kind="stable"))
 
 
