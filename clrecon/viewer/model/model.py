@@ -20,7 +20,7 @@ from clrecon.rendering.pictures.styles import DEFAULT_ISO_VALUE
 from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.directions import as_point, checked_vector, default_view, shows_slices
 from clrecon.rendering.views.reformation import PLANES
-from clrecon.system.arguments import Space
+from clrecon.system.arguments import DirectionName, Space
 from clrecon.system.text import format_hu, unknown_name
 from clrecon.viewer.model.changes import ChangingView, checked_numbers, fit_camera, height_mm
 from clrecon.viewer.model.measures import (
@@ -552,10 +552,11 @@ class ViewModel(ChangingView):
         return corners.min(axis=0), corners.max(axis=0)
 
 
-def _first_side(extent: Float64Array) -> str:
+def _first_side(extent: Float64Array) -> DirectionName:
     """Return the side from which a view begins: the front, or the face of slices so few that they are a line."""
     least, next_least, _ = np.sort(extent)
-    return ("left", "anterior", "inferior")[int(np.argmin(extent))] if least < _FLAT * next_least else "anterior"
+    faces: tuple[DirectionName, ...] = ("left", "anterior", "inferior")
+    return faces[int(np.argmin(extent))] if least < _FLAT * next_least else "anterior"
 
 
 def checked_slab(thickness: Any) -> float:

@@ -34,7 +34,7 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from clrecon.errors import ClreconError, UsageError
+from clrecon.errors import ClreconError, RefusedInputError, UsageError
 from clrecon.exchange.page import hash_code, read_page_code
 from clrecon.jobs.view import ViewSettings
 from clrecon.jobs.view.inputs import check_view_settings
@@ -213,7 +213,7 @@ class WebServer:
         start: StartRoom | None = None,
         is_framed: bool = False,
     ) -> None:
-        self._start = start
+        self.start = start
         self._is_framed = is_framed
         self._save_as, self._wrote = save_as, wrote
         self._listener = bind_port(port)
@@ -240,8 +240,8 @@ class WebServer:
         """
         with tempfile.TemporaryDirectory(prefix="clrecon-") as folder, contextlib.suppress(KeyboardInterrupt):
             self._downloads = Path(folder)
-            if self._start is not None:
-                self._start.settle(self._downloads)
+            if self.start is not None:
+                self.start.settle(self._downloads)
             asyncio.run(self._serve(open_session, ready))
 
     def stop(self) -> None:
@@ -266,8 +266,8 @@ class WebServer:
         application.router.add_get("/", self._send_page, allow_head=False)
         application.router.add_get("/socket", self._connect, allow_head=False)
         application.router.add_get("/saved/{ticket}", self._send_saved, allow_head=False)
-        if self._start is not None:
-            StartDoors(self._start, self._leave_all).add_to(application)
+        if self.start is not None:
+            StartDoors(self.start, self._leave_all).add_to(application)
         runner = web.AppRunner(
             application, access_log=None, logger=silent, handle_signals=False, shutdown_timeout=_SECONDS_TO_END
         )
@@ -316,7 +316,7 @@ class WebServer:
     async def _send_page(self, request: web.Request) -> web.Response:
         from aiohttp import web
 
-        start = self._start is not None and (self._start.view is None or "start" in request.query)
+        start = self.start is not None and (self.start.view is None or "start" in request.query)
         page = compose_page(request.headers["Host"], start=start, is_framed=self._is_framed)
         policy = {"Content-Security-Policy": page.policy}
         response = web.Response(body=page.content, content_type="text/html", charset="utf-8", headers=policy)
@@ -335,7 +335,7 @@ class WebServer:
             connection = Connection(
                 self._open_session, socket, self._downloads, save_as=self._save_as, wrote=self._wrote, quit=self.stop,
             )  # fmt: skip
-            connection.has_start, connection.link = self._start is not None, self._keep_link
+            connection.has_start, connection.link = self.start is not None, self._keep_link
             tab = request.query.get("tab", "")[:_MOST_TAB]
             connection.resume(self._left.get(tab) or self._linked.get(request.query.get("view", "")))
         except ClreconError as error:
@@ -457,17 +457,25 @@ def serve_view(
         room = None if inputs else StartRoom(settings)
         server = stack.enter_context(WebServer(port, save_as=save_as, wrote=wrote, start=room))
         notes: list[str] = []
-        if room is not None:
+        try:
+            view = stack.enter_context(open_view(inputs, settings, progress=progress)) if room is None else None
+        except RefusedInputError as error:  # several series, of which none is the one to show
+            room, view = StartRoom.of_folder(inputs, settings), None
+            if room is None:
+                raise
+            server.start = room
+            notes = [f"{error}; or choose it on the page"]
+        if view is None:
+            assert room is not None
             device = take_device(settings.scan.device)
             open_session: OpenSession = stack.enter_context(room).open_session
         else:
-            view = stack.enter_context(open_view(inputs, settings, progress=progress))
             first = stack.enter_context(view.session())  # nobody looks through it: it builds kernels meanwhile
             device, notes = view.painter.device, view.said
             open_session = view.session
 
         def begin(folder: Path) -> None:
-            if room is None:
+            if view is not None:
                 first.prepare()
             warnings = list(notes)
             if opens and has_screen():

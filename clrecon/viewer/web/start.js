@@ -70,15 +70,19 @@
       await Promise.all(Array.from({ length: AT_A_TIME }, work));
       say("Looking what it is.");
       showProgress(undefined);
-      const { choices, waiting } = await ask("list");
-      showWaiting(waiting);
-      showChoices(choices, waiting);
+      await showList();
     } catch (error) {
       say(error.message, true);
     } finally {
       showProgress(null);
       busy = false;
     }
+  }
+
+  async function showList() {
+    const { choices, waiting } = await ask("list");
+    showWaiting(waiting);
+    showChoices(choices, waiting);
   }
 
   function showChoices(choices, waiting) {
@@ -131,7 +135,7 @@
     }
   }
 
-  ask("progress").then(({ waiting }) => showWaiting(waiting));
+  ask("progress").then(({ waiting, listed }) => { if (listed) showList(); else showWaiting(waiting); });
   find("forget").onclick = () => { ask("forget").then(() => { showWaiting(""); say(""); }); };
 
   const picked = (input) => [...input.files].map((file) => [file.webkitRelativePath || file.name, file]);

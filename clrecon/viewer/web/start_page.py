@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import shutil
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import fields, replace
 from pathlib import Path
@@ -20,6 +20,7 @@ from clrecon.reading.common.selection import Selection
 from clrecon.system.base_classes import Closing
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.log import get_logger
+from clrecon.system.progress import ignore_progress
 from clrecon.system.text import escape_text
 from clrecon.viewer.model.saved_view import VIEW_FORMAT, read_view, say_source
 from clrecon.viewer.session.choices import Choice, checked_choice, find_choices, find_saved_view
@@ -68,6 +69,18 @@ class StartRoom(Closing):
         self.folder: Path | None = None
         self._drop = 0
         self._bytes = self._files = 0
+
+    @classmethod
+    def of_folder(cls, inputs: Sequence[str | Path], settings: ViewSettings) -> StartRoom | None:
+        """Return a room that offers what one folder holds; None where there is less than two to choose from."""
+        if len(inputs) != 1 or not Path(inputs[0]).is_dir():
+            return None
+        room = cls(settings)
+        room.choices = find_choices(Path(inputs[0]), room._archives, ignore_progress)
+        if sum(not choice.is_refused for choice in room.choices) > 1:
+            return room
+        room.close()
+        return None
 
     def settle(self, folder: Path) -> None:
         """Take a private folder for what is dropped."""
@@ -123,6 +136,8 @@ class StartRoom(Closing):
 
     def list_choices(self) -> list[dict[str, Any]]:
         """List what can be opened of the drop; it takes a while.  A saved view that comes alone waits for its scan."""
+        if not self._drop:
+            return [choice.describe() for choice in self.choices]
         self._archives.close()
         self.choices = find_choices(self._place(), self._archives, self._tell)
         saved = find_saved_view(self._place())
@@ -255,7 +270,9 @@ class StartDoors:
 
     async def _progress(self, request: web.Request) -> web.Response:
         stage, done, total = self._room.progress
-        return _answer({"stage": stage, "done": done, "total": total, "waiting": self._room.waiting})
+        room = self._room
+        known = {"waiting": room.waiting, "listed": bool(room.choices)}
+        return _answer({"stage": stage, "done": done, "total": total, **known})
 
 
 def _answer(content: dict[str, Any]) -> web.Response:

@@ -17,12 +17,13 @@ from typing import Any
 
 import pytest
 import view_scenes as scenes
+from dicom_series import Plan, write_series
 from printed_text import Printer
 from variants import daily
-from web_views import browsing
+from web_views import browsing, get_path, secret_of
 
 from clrecon.cli.main import main
-from clrecon.errors import NoDicomError
+from clrecon.errors import NoDicomError, RefusedInputError
 from clrecon.reading.grids.write_volume import write_volume
 from clrecon.viewer.web.server import bind_port
 
@@ -106,6 +107,42 @@ def test_server_removes_its_folder_of_temporary_files_when_a_signal_ends_it(
         assert process.wait(SECONDS_TO_END) == 0
 
     assert list(tmp_path.glob("clrecon-*")) == []
+
+
+@pytest.mark.seconds
+@pytest.mark.opencl
+def test_folder_of_two_series_opens_the_start_page_with_both_of_them(device, tmp_path: Path) -> None:
+    for number in (1, 2):
+        write_series(tmp_path / str(number), Plan(shape=(7, 30, 40), series=number))
+
+    with start_view(str(tmp_path), "--device", str(device.index)) as (_, said):
+        server = SimpleNamespace(port=said["port"], address=said["address"])
+        query = f"?secret={secret_of(server)}"
+        status, _, told = get_path(server, f"/start/progress{query}")
+        _, _, listed = get_path(server, f"/start/list{query}", "POST", Origin=f"http://127.0.0.1:{server.port}")
+
+    assert (status, json.loads(told)["listed"]) == (200, True)
+    assert [choice["title"] for choice in json.loads(listed)["choices"]] == ["series 1 · CT", "series 2 · CT"]
+    assert any("choose it on the page" in warning for warning in said["warnings"])
+
+
+def test_folder_of_one_series_that_is_refused_is_refused_by_the_view(tmp_path: Path, printed: Printer) -> None:
+    write_series(tmp_path / "one", Plan(shape=(9, 30, 40), leave_out=(4,)))
+
+    assert main(["view", str(tmp_path), "--no-open"]) == RefusedInputError.exit_code
+
+    printed().assert_error("--allow-gaps")
+
+
+def test_picture_of_a_folder_of_two_series_is_refused_with_the_option_that_chooses(
+    tmp_path: Path, printed: Printer
+) -> None:
+    for number in (1, 2):
+        write_series(tmp_path / str(number), Plan(shape=(7, 30, 40), series=number))
+
+    assert main(["view", str(tmp_path), "--picture", str(tmp_path / "a.png")]) == RefusedInputError.exit_code
+
+    printed().assert_error("--series")
 
 
 @pytest.mark.release
