@@ -47,8 +47,11 @@ SMALL_COMMANDS = (
     "vertebrae scan -o spine.nii.gz",
     "export scan -o scan.nii.gz",
     "view scan --html page.html",
+    "batch scan -o many",
+    "bench scan --runs 2",
+    "compare scan -o report --hu 226 --repeat 1",
 )
-"""What an installation without VTK, pyvista and matplotlib runs."""
+"""What an installation without VTK, pyvista, matplotlib and scikit-image runs."""
 TESTS = ("tests/guards", "tests/geometry", "tests/exchange")
 
 

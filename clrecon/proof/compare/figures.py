@@ -7,6 +7,7 @@ Figures 10 and 11."""
 from __future__ import annotations
 
 import base64
+import contextlib
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -233,6 +234,11 @@ def middle_slice(volume: Volume, size: tuple[int, int], offset: int = 0) -> NDAr
     return np.asarray(Image.fromarray(grey).resize(size, Image.Resampling.BILINEAR))
 
 
+def measure_likeness(picture: NDArray[np.uint8], reference: NDArray[np.uint8], **choice: bool) -> dict[str, float]:
+    likeness = measure_pictures(picture, reference, **choice)
+    return {"ssim": likeness.ssim, "mse": likeness.mse}
+
+
 def measure_against_slice(
     volume: Volume, pictures: Mapping[str, NDArray[np.uint8]], size: tuple[int, int]
 ) -> dict[str, Any]:
@@ -240,16 +246,12 @@ def measure_against_slice(
     wanted = middle_slice(volume, size)
     controls = make_control_pictures(wanted, middle_slice(volume, size, 1))
 
-    def like(picture: NDArray[np.uint8]) -> dict[str, float]:
-        grey = np.rint(picture.mean(axis=2)).astype(np.uint8) if picture.ndim == 3 else picture
-        figures = measure_pictures(grey, wanted, whole=True)
-        return {"ssim": figures.ssim, "mse": figures.mse}
-
+    greys = {name: np.rint(picture.mean(axis=2)).astype(np.uint8) for name, picture in pictures.items()}
     return {
-        "window_hu": [-200.0, 800.0],
+        "window_hu": list(WINDOW_HU),
         "slice": volume.shape_ijk[2] // 2,
-        "methods": {name: like(picture) for name, picture in pictures.items()},
-        "controls": {name: like(controls[name]) for name in CONTROLS if name in controls},
+        "methods": {name: measure_likeness(grey, wanted, whole=True) for name, grey in greys.items()},
+        "controls": {name: measure_likeness(controls[name], wanted, whole=True) for name in CONTROLS},
     }
 
 
@@ -267,20 +269,6 @@ def choose_camera(volume: Volume, box: NDArray[np.float64]) -> dict[str, Any]:
     ends = np.stack([low - 1.0, high + 1.0])
     places = volume.ijk_to_lps([[ends[bit >> axis & 1, axis] for axis in range(3)] for bit in range(8)])
     return asdict(Camera.fit(box_around([places]), VIEW, size=SIZE))
-
-
-def compare_pictures(pictures: Mapping[str, Image], reference: str) -> dict[str, dict[str, float]]:
-    """Return ``mse`` and ``ssim`` of each picture to that of the reference; without one, nothing."""
-    if reference not in pictures:
-        return {}
-    likeness = {}
-    for name, picture in pictures.items():
-        try:
-            like = measure_pictures(picture, pictures[reference])
-        except ClreconError:  # nothing is drawn in either
-            continue
-        likeness[name] = {"mse": like.mse, "ssim": like.ssim}
-    return likeness
 
 
 def difference_of(picture: Image, reference: Image) -> Image:
@@ -335,10 +323,11 @@ class Figures:
     paper: dict[str, Any] | None = None
 
     def complete(self, records: Sequence[MethodRecord]) -> list[MethodRecord]:
-        size = self.views[self.reference].shape if self.reference in self.views else None
-        likeness = compare_pictures(
-            {name: view for name, view in self.views.items() if view.shape == size}, self.reference
-        )
+        reference, likeness = self.views.get(self.reference), {}
+        for name, view in self.views.items():
+            if reference is not None and view.shape == reference.shape:
+                with contextlib.suppress(ClreconError):  # nothing is drawn in either
+                    likeness[name] = measure_likeness(view, reference)
         return [
             record.changed(
                 pictures=likeness.get(record.name),

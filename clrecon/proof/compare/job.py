@@ -9,7 +9,6 @@ import math
 import os
 import re
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -33,7 +32,7 @@ from clrecon.proof.compare.figures import (
     find_planes,
 )
 from clrecon.proof.compare.findings import CompareReport
-from clrecon.proof.compare.methods import COMPARED, Compared, CompareSettings
+from clrecon.proof.compare.methods import COMPARED, Compared, CompareSettings, choose_methods
 from clrecon.proof.compare.page import make_page
 from clrecon.proof.compare.processes import Request, measure_in_processes, run_in_process, save_volume
 from clrecon.proof.compare.records import Given, compose_report, make_record
@@ -63,36 +62,18 @@ def check_report_folder(path: str | os.PathLike[str]) -> Path:
     return folder
 
 
-class MadeFolder(StagedFolder):
-    """The folder while it is filled, at its temporary `path`."""
-
-    def __init__(self, path: str | os.PathLike[str], staged: Path, folder: Path):
-        super().__init__(path, staged, folder, 0)
-        self._shown, self.path = path, staged
-
-    def write(self, name: str, text: str) -> None:
-        with system_errors(self._shown), open(self.path / name, "x", encoding="utf-8", newline="\n") as stream:
-            stream.write(text)
-
-    def commit(self) -> None:
-        """Bring all files to the disk, and the folder to its place."""
-        with system_errors(self._shown):
-            for entry in os.scandir(self.path):
-                with open(entry.path, "rb") as stream:
-                    os.fsync(stream.fileno())
-                    self.size += os.fstat(stream.fileno()).st_size
-        super().commit()
-
-
 @contextlib.contextmanager
-def stage_report_folder(path: str | os.PathLike[str]) -> Iterator[MadeFolder]:
-    """Make a folder under a temporary name; one that is not committed is removed at the end of the block."""
-    folder = check_report_folder(path)
-    with contextlib.ExitStack() as stack:
-        with system_errors(path):
-            staged = stack.enter_context(temporary_folder(folder.parent))
-            staged.chmod(final_mode(folder, 0o777))
-        yield MadeFolder(path, staged, folder)
+def stage_report_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Make a folder under a temporary name; at the end of the block its files go to the disk, and it to its place."""
+    folder, size = check_report_folder(path), 0
+    with system_errors(path), temporary_folder(folder.parent) as staged:
+        staged.chmod(final_mode(folder, 0o777))
+        yield staged
+        for file in staged.iterdir():
+            with open(file, "rb") as stream:
+                os.fsync(stream.fileno())
+                size += os.fstat(stream.fileno()).st_size
+        StagedFolder(path, staged, folder, size).commit()
 
 
 log = get_logger(__name__)
@@ -128,7 +109,7 @@ def make_comparison(
     given = given._replace(warnings=[*left_out, *given.warnings])
     volume, level = given.volume, given.level
     watch.lap("mask")
-    with ExitStack() as stack:
+    with contextlib.ExitStack() as stack:
         with system_errors(output):
             work = stack.enter_context(temporary_folder(folder.parent))
             save_volume(work, volume)
@@ -145,13 +126,10 @@ def make_comparison(
         if settings.paper:
             figures.compare_with_slice()
         report = compose_report(given, settings, device, records, figures, read_s, watch)
-        with keep_existing(keep=no_clobber):
-            staged = stack.enter_context(stage_report_folder(output))
-            with system_errors(output):
-                draw_figures(figures, staged.path)
-                staged.write("index.html", make_page(report, figures))
-            staged.write(REPORT, to_json(report) + "\n")
-            staged.commit()
+        with keep_existing(keep=no_clobber), stage_report_folder(output) as staged:
+            draw_figures(figures, staged)
+            for name, text in ((PAGE, make_page(report, figures)), (REPORT, to_json(report) + "\n")):
+                (staged / name).write_text(text, encoding="utf-8", newline="\n")
     log_warnings(log, report.warnings, volume.report.get("warnings", ()))
     log.info("%d methods compared on %s in %.3f s", len(records), report.device, watch.total())
     return report
@@ -160,7 +138,8 @@ def make_comparison(
 def choose_installed(settings: CompareSettings) -> tuple[list[Compared], list[str]]:
     """Return the methods whose packages are installed, and a line on what is left out; named methods must be there."""
     absent: dict[str, list[str]] = {}
-    needs = [(method.name, method.module) for method in settings.chosen if method.module]
+    chosen = choose_methods(settings.methods, settings.reference)
+    needs = [(method.name, method.module) for method in chosen if method.module]
     for name, module in (*needs, ("plots", "matplotlib")):
         if not is_installed(module):
             if name in (*settings.methods, settings.reference):
@@ -169,7 +148,7 @@ def choose_installed(settings: CompareSettings) -> tuple[list[Compared], list[st
     lacking = ", ".join(f"{list_names(names)} ({package})" for package, names in absent.items())
     left_out = [f"left out, their packages are not installed: {lacking}"] if absent else []
     unavailable = set(chain(*absent.values()))
-    return [method for method in settings.chosen if method.name not in unavailable], left_out
+    return [method for method in chosen if method.name not in unavailable], left_out
 
 
 def _check_truth(path: Path) -> str:

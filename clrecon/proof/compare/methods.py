@@ -125,10 +125,6 @@ class CompareSettings(InputSettings):
         if len(self.as_mesh().levels) != 1:
             raise UsageError("methods are compared at one iso value")
 
-    @property
-    def chosen(self) -> tuple[Compared, ...]:
-        return choose_methods(self.methods, self.reference)
-
     def as_mesh(self) -> MeshSettings:
         """Return the settings of a mesh job with the same input and level."""
         shared = {field.name: getattr(self, field.name) for field in fields(InputSettings)}

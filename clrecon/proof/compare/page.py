@@ -163,19 +163,13 @@ def _start_figure(width: float, height: float) -> tuple[Any, Any]:
 
     figure = Figure(figsize=(width, height), layout="constrained")
     axes = figure.add_subplot()
-    figure.patch.set_alpha(0.0)
-    axes.patch.set_alpha(0.0)
     for name, spine in axes.spines.items():
-        spine.set_visible(name in ("left", "bottom"))
-        spine.set_color(_INK)
-        spine.set_alpha(0.5)
+        spine.set(visible=name in ("left", "bottom"), color=_INK, alpha=0.5)
     axes.tick_params(colors=_INK, labelsize=9)
     axes.grid(axis="x", color=_INK, alpha=0.12, linewidth=0.6)
     axes.set_axisbelow(True)
-    axes.xaxis.label.set_color(_INK)
-    axes.yaxis.label.set_color(_INK)
-    axes.xaxis.label.set_fontsize(10)
-    axes.yaxis.label.set_fontsize(10)
+    for label in (axes.xaxis.label, axes.yaxis.label):
+        label.set(color=_INK, fontsize=10)
     return figure, axes
 
 
@@ -202,8 +196,8 @@ def _finish_figure(figure: Any, name: str) -> str:
 
 def make_page(report: CompareReport, figures: Figures) -> str:
     note = (
-        "Bold: the best of the surfaces. Grey: libraries of others. Bars, pictures and contours have the colour"
-        " beside the name."
+        "Bold: the best of the surfaces. Grey: libraries of others. Contours and points of plots have the colour beside"
+        " the name."
     )
     memory = "all of the device" if report.memory_allowed_bytes is None else f"{report.memory_allowed_bytes:,} bytes"
     rows = [
