@@ -80,9 +80,8 @@ def survey_surface(
     by_triangle: The sums have the arrays of all triangles.
     """
     vertex_count, triangle_count = len(vertices), len(triangles)
-    if triangle_count and int(triangles.max()) >= vertex_count:
+    if topology is None and triangle_count and int(triangles.max()) >= vertex_count:
         raise UsageError(f"a triangle refers to vertex {int(triangles.max())}, the mesh has {vertex_count} vertices")
-
     topology = topology or connectivity.find_topology(triangles, vertex_count)
     components, labels = topology.labelled
     unused = int(np.count_nonzero(labels < 0))

@@ -272,3 +272,5 @@ class WebFile:
                     progress("fetch", 0, 0)
 
         persist(fetch_whole, self._name, self._patience)
+        if not file.stat().st_size:
+            raise RefusedInputError(f"{self._name} sends an empty file: there is no scan in it")

@@ -204,6 +204,22 @@ def test_file_of_the_web_that_is_not_there_is_no_dicom(server: Server) -> None:
         read_volume(f"http://{server.host}/scan.zip")
 
 
+def test_empty_file_of_the_web_is_refused(server: Server) -> None:
+    server.answers = [answering(b"")]
+    with refused(RefusedInputError, server.host, "empty"):
+        read_volume(f"http://{server.host}/scan.zip")
+
+
+def test_file_of_the_web_of_unknown_length_is_refused_where_it_has_more_bytes_than_allowed(server: Server) -> None:
+    server.answers = [answering(bytes(2000), Content_Length="")]
+
+    with (
+        refused(RefusedInputError, "TMPDIR"),
+        opened(f"http://{server.host}/a", ignore_progress, Limits(fetched_bytes=1999)),
+    ):
+        pass
+
+
 def test_file_of_the_web_larger_than_allowed_is_refused(server: Server) -> None:
     server.answers = [answering(Content_Length="2000")]  # none of them arrives
 
@@ -289,6 +305,17 @@ def memory(contents: dict[str, bytes], packed: bytes) -> Iterator[Any]:
 @pytest.mark.parametrize("url", ["memory://scan", "memory://scan/", "memory://s.zip"])
 def test_url_of_another_file_system_is_read_as_its_folder(url: str, memory: Any, scan: Path) -> None:
     assert_read_as(url, scan)
+
+
+@pytest.mark.parametrize("more", [-1, 1])
+def test_file_of_another_file_system_with_more_or_fewer_bytes_than_listed_is_refused_with_both_sizes(
+    more: int, memory: Any, packed: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    listed = {"/s.zip": {"size": len(packed) + more, "type": "file"}}
+
+    with monkeypatch.context() as lying, refused(RefusedInputError, f"{len(packed) + more:,}", f"{len(packed):,}"):
+        lying.setattr(memory, "find", lambda path, detail: listed)
+        read_volume("memory://s.zip")
 
 
 def test_url_of_another_file_system_with_nothing_there_is_no_dicom(memory: Any) -> None:

@@ -284,6 +284,7 @@ def _measure_on_host(parts: Sequence[Part], topologies: Sequence[Topology], volu
     twice_areas = []
     for part, topology in zip(parts, topologies, strict=True):
         mesh = part.mesh
+        part.topology = None  # which has a number for each vertex
         part.quality, _, sums = survey_surface(mesh.vertices, mesh.triangles, topology, by_triangle=True)
         if part.quality.components > _MANY_COMPONENTS:
             part.component_ml = measure_component_ml(mesh.triangles, sums, topology)

@@ -52,6 +52,7 @@ def test_topology_found_with_the_components_is_not_looked_for_again(
     measure_parts([part], Volume(VOXELS, np.diag((0.5, 0.7, 1.2, 1.0))), MeshSettings(iso_value=1.0), device)
 
     assert part.quality == measured_by_host.quality
+    assert part.topology is None  # its memory is free
     assert (count, labels.tolist()) == (part.quality.components, label_part(part, device, MeshSettings())[1].tolist())
 
 
