@@ -392,12 +392,9 @@ def _refuse_few(count: int, vertices: int) -> None:
 
 
 def _describe_fit(
-    fit: CortexFit,
-    resident: DeviceVolume,
-    points: NDArray[np.floating],
-    normals: NDArray[np.floating],
+    fit: CortexFit, resident: DeviceVolume, points: NDArray[np.floating], normals: NDArray[np.floating],
     unmoved: int | None,
-) -> CortexReport:
+) -> CortexReport:  # fmt: skip
     """Report a fit; unmoved is None where the surface was not moved."""
     fitted = fit.states == FITTED
     shift, thickness = fit.shift_mm[fitted].astype(np.float64), fit.thickness_mm[fitted]

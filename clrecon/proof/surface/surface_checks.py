@@ -343,7 +343,7 @@ where two walls are as good, or whose cost hardly changes along a valley of thic
 
 
 def twin_scale(sampler: ProfileSampler) -> cortex_twin.Scale:
-    return cortex_twin.Scale(sampler.scale.first_mm, sampler.scale.step_mm, sampler.scale.weights)
+    return cortex_twin.Scale(sampler.scale.first_mm, sampler.scale.step_mm, sampler.scale.place_weights)
 
 
 def scatter_profiles(volume: Volume, seed: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -395,7 +395,7 @@ def _check_fits(device: Device) -> str:
     volume = blobs((8, 9, 10), np.eye(4), "int16")
     with DeviceVolume(volume, device=device) as resident:
         sampler = ProfileSampler(resident, Stopwatch())
-        rows = np.stack(sampler.take(values).fit(0.66, 0.81, 980.0, 20.0).rows())
+        rows = np.stack(sampler.take(values).fit(0.66, 0.81, 980.0, 20.0, finds_place=True).rows())
     precisions = expected_precisions(980.0, 20.0, CORTEX_SPREAD)
     expected = cortex_twin.fit_profiles(
         values.astype(np.float64), twin_scale(sampler), 0.66, 0.81, 980.0, precisions, 100.0

@@ -79,6 +79,16 @@ def test_fitted_shell_is_nearer_to_bone_than_the_level(fitted_shell):
     assert np.abs(away).mean() < 0.12  # mm; measured 0.02 to 0.05
 
 
+def test_fat_2_mm_outside_of_bone_moves_its_surface_by_less_than_a_sixth_of_a_voxel(device):
+    volume = hollow_ball(thickness=1.0)
+    away = np.linalg.norm(np.moveaxis(np.indices(volume.voxels.shape)[::-1], 0, -1) - MIDDLE, axis=-1)
+    fat = 150.0 * ndtr((away - OUTER_RADIUS - 2.0) / 0.7)
+    constants = constants_with_blurs(within_mm=0.8, across_mm=0.8)
+    mesh, fit = fit_surface(volume.with_voxels(np.rint(volume.voxels - fat).astype(np.int16)), device, 200.0, constants)
+    # mm; measured 0.147, and 0.194 where samples outside count as much as those inside
+    assert outer_places(mesh, fit)[0].mean() < 0.167
+
+
 def test_fitted_shell_has_its_thickness_to_a_third_of_a_voxel(fitted_shell):
     thickness, mesh, fit = fitted_shell
     _, rows = outer_places(mesh, fit)
@@ -331,7 +341,7 @@ def test_walls_unlike_the_cortex_of_the_scan_have_errors_larger_by_a_factor_and_
     np.testing.assert_allclose(standard_errors(wall, constants), factor * standard_errors(usual, constants), rtol=1e-5)
 
 
-@pytest.mark.parametrize(("noise_hu", "error_mm", "state"), [(300.0, 1.23, "fitted"), (700.0, 4.0, "badly fitted")])
+@pytest.mark.parametrize(("noise_hu", "error_mm", "state"), [(300.0, 1.4, "fitted"), (700.0, 5.6, "badly fitted")])
 def test_walls_with_standard_errors_above_2_5_mm_are_badly_fitted(device, noise_hu, error_mm, state):
     noisy = constants_with_blurs(within_mm=0.8, across_mm=0.8).changed(noise_hu=noise_hu)
     _, fit = fit_surface(hollow_ball(thickness=1.0), device, constants=noisy)
