@@ -124,18 +124,13 @@ def trilinear_values(volume: Volume, rule: IsoRule, ijk: Float64Array) -> Float6
 
 def _split_cells(volume: Volume, rule: IsoRule, ijk: Float64Array) -> tuple[NDArray[np.int64], Float64Array]:
     """Return the lowest corner of each point's cell, and the position of the point in it, all (3, n)."""
-    points = _keep_within(volume, rule, ijk)
-    cell = np.empty(points.shape, np.int64)
-    for floors, point, count in zip(cell, points, volume.shape_ijk, strict=True):
-        np.clip(np.floor(point), -rule.border, max(count - 2 + rule.border, -rule.border), out=floors, casting="unsafe")
-    points -= cell
-    return cell, points
-
-
-def _keep_within(volume: Volume, rule: IsoRule, ijk: Float64Array) -> Float64Array:
-    """Return index coordinates, (3, n), beyond the border moved to it: there the field does not change."""
-    ends = zip(ijk, volume.shape_ijk, strict=True)
-    return np.stack([np.clip(numbers, -rule.border, count - 1 + rule.border) for numbers, count in ends])
+    low = -rule.border
+    cell, within = np.empty(ijk.shape, np.int64), np.empty(ijk.shape)
+    for floors, shares, numbers, count in zip(cell, within, ijk, volume.shape_ijk, strict=True):
+        np.clip(numbers, low, count - 1 + rule.border, out=shares)
+        np.clip(np.floor(shares), low, max(count - 2 + rule.border, low), out=floors, casting="unsafe")
+    within -= cell
+    return cell, within
 
 
 def distances_to_iso_surface(volume: Volume, rule: IsoRule, points: Float64Array) -> Float64Array:
@@ -166,14 +161,15 @@ def _distances_to_level(volume: Volume, rule: IsoRule, level: float, points: Flo
 
     def take_step(going: NDArray[np.int64], here: Float64Array) -> tuple[NDArray[np.int64], Float64Array]:
         """Move points, (3, n), towards the surface; return those that have not reached it, and where they are."""
-        ijk = _keep_within(volume, rule, volume.lps_to_ijk(here.T).T)
+        # Beyond the border the field does not change: a step from there would begin at the border all the same.
+        ijk = np.add(*_split_cells(volume, rule, volume.lps_to_ijk(np.ascontiguousarray(here.T)).T))
         position = np.ascontiguousarray(volume.ijk_to_lps(ijk.T).T)
         value, per_step = trilinear_field(volume, rule, ijk.T)
         slices: Any = slice(1)
         if volume.uneven:
             slices = np.clip(np.floor(ijk[2]).astype(np.int64) + rule.border, 0, matrices.shape[2] - 1)
         rows = matrices[:, :, slices]
-        gradient = rows[:, 0] * per_step[:, 0] + rows[:, 2] * per_step[:, 2] + rows[:, 1] * per_step[:, 1]
+        gradient = rows[:, 0] * per_step[:, 0] + rows[:, 1] * per_step[:, 1] + rows[:, 2] * per_step[:, 2]
         square = gradient[0] ** 2 + gradient[2] ** 2 + gradient[1] ** 2
         if not square.all():  # a point of a flat field has no way
             uphill = square > 0.0
