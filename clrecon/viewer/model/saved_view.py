@@ -21,7 +21,7 @@ from clrecon.viewer.model.measures import POINTS_OF, REGIONS, Measure, checked_m
 from clrecon.viewer.model.model import ViewModel, checked_slab
 from clrecon.viewer.model.objects import ShownObject, ShownScan, first_parts
 from clrecon.viewer.model.planes import check_plane, checked_turn
-from clrecon.viewer.model.state import LEAST_ZOOM, MOST_ZOOM, ClipPlane, ShownPart, SliceFrame, ViewState
+from clrecon.viewer.model.state import LEAST_ZOOM, MOST_ZOOM, ClipPlane, ShownPart, ViewState
 
 VIEW_FORMAT = ".view.json"
 
@@ -48,7 +48,9 @@ def encode_view(state: ViewState, objects: Sequence[ShownObject]) -> bytes:
         "slab": {"thickness_mm": state.slab_mm, "combine": state.combine},
         "layout": state.layout,
         "compare": state.compare,
-        "slices": [_describe_frame(each) for each in state.frames],
+        "slices": [
+            {"plane": each.plane, "zoom": each.zoom, "center_lps_mm": list(each.center)} for each in state.frames
+        ],
         "parts": [_describe_look(each) for each in state.parts if not each.is_plain],
         "measures": [
             {
@@ -76,10 +78,6 @@ def _describe_grids(objects: Sequence[ShownObject]) -> list[dict[str, Any]]:
         }
         for each in volumes
     ]
-
-
-def _describe_frame(frame: SliceFrame) -> dict[str, Any]:
-    return {"plane": frame.plane, "zoom": frame.zoom, "center_lps_mm": list(frame.center)}
 
 
 def _describe_look(part: ShownPart) -> dict[str, Any]:

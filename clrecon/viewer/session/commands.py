@@ -54,12 +54,8 @@ def _size(value: Any) -> tuple[int, int]:
     return width, height
 
 
-def _direction(value: Any) -> str | tuple[float, ...]:
-    return _text(value) if isinstance(value, str) else _check_numbers(3)(value)
-
-
-def _view(value: Any) -> str | tuple[float, ...]:
-    return _text(value) if isinstance(value, str) else _check_numbers(2)(value)
+def _name_or_numbers(count: int) -> Callable[[Any], str | tuple[float, ...]]:
+    return lambda value: _text(value) if isinstance(value, str) else _check_numbers(count)(value)
 
 
 def _or_none(check: Callable[[Any], Any]) -> Callable[[Any], Any]:
@@ -94,7 +90,7 @@ _model("pan", "shift what is seen, in shares of the height", "pan", dx=_check_nu
 _model("zoom", "show larger; at: from the middle, in shares of the height", "zoom",
        factor=_check_number, takes={"at": _check_numbers(2)})  # fmt: skip
 _model("roll", "turn the picture clockwise, degrees", "roll", degrees=_check_number)
-_model("look", "look from a side of the patient, or azimuth and elevation", "look", view=_view)
+_model("look", "look from a side of the patient, or azimuth and elevation", "look", view=_name_or_numbers(2))
 _model("set_perspective", "a perspective or a parallel camera", "set_perspective", on=_flag)
 _model("toggle_perspective", "a perspective camera for a parallel one, or back", "toggle_perspective")
 _model("set_iso", "iso value of the surfaces, HU", "set_iso", hu=_check_number)
@@ -153,7 +149,7 @@ _model("end_tool", "put the tool away; a curve is made", "end_tool")
 _model("rename_measure", "name a measure by its number, from 0", "rename_measure", n=_whole, name=_text)
 _model("remove_measure", "drop one measure", "remove_measure", n=_whole)
 _model("clear_measures", "drop all measures", "clear_measures")
-_model("add_clip", "cut with a plane towards a side", "add_clip", direction=_direction)
+_model("add_clip", "cut with a plane towards a side", "add_clip", direction=_name_or_numbers(3))
 _model("move_clip", "move a plane, 0 to 1", "move_clip", n=_whole, share=_check_number)
 _model("flip_clip", "take the other side of a plane away", "flip_clip", n=_whole)
 _model("remove_clip", "drop a plane", "remove_clip", n=_whole)

@@ -66,16 +66,12 @@ class OpenedView(Closing):
         self._iso_value = choose_iso(self.objects, scan, progress)
         self._space, self._keep_ids = scan.space, scan.keep_ids
         self._progress = progress
-        self._fitted = scan.surface == "cortex" and any(isinstance(each, ShownScan) for each in self.objects)
+        has_scan = any(isinstance(each, ShownScan) for each in self.objects)
+        self._fitted = scan.surface == "cortex" and has_scan
         self._saved = carried if settings.state is None else read_view(settings.state)
         self._carried = carried
         self.painter = Painter(self.objects, device=scan.device, memory=scan.memory)
-        self._begins_with_bone = (
-            self._saved is None
-            and not self._fitted
-            and self._iso_value is None
-            and any(isinstance(each, ShownScan) for each in self.objects)
-        )
+        self._begins_with_bone = has_scan and not self._fitted and (self._saved, self._iso_value) == (None, None)
         self._begins_bare = self._begins_with_bone and not scan.remove_table and self._take_table(progress)
 
     def _take_table(self, progress: Progress) -> bool:

@@ -75,7 +75,7 @@ def test_slice_says_its_number_place_and_window(page) -> None:
 @pytest.mark.parametrize("stage_width", [330, 700, 1200])
 def test_name_of_a_slice_ends_left_of_the_letter_of_its_upper_side(page, stage_width: int) -> None:
     page.execute_script("document.getElementById('stage').style.maxWidth = `${arguments[0]}px`", stage_width)
-    wait_for(page, f"return coronal.clientWidth <= {stage_width / 3} && clrecon.facts.settled")
+    wait_for(page, f"return coronal.clientWidth < {stage_width / 2} && clrecon.facts.settled")
 
     name, letter = page.execute_script(
         "const [name, letter] = ['name', 'side'].map((kind) => coronal.querySelector(`text.${kind}`));"
@@ -121,7 +121,7 @@ def test_slice_says_nothing_of_a_point_once_the_mouse_has_left_it(page) -> None:
 )
 def test_narrow_slice_says_hu_and_the_place_only_where_it_has_room(page, stage_width: int, lines: int) -> None:
     page.execute_script("document.getElementById('stage').style.maxWidth = `${arguments[0]}px`", stage_width)
-    wait_for(page, f"return axial.clientWidth < {stage_width / 3} && clrecon.facts.settled")
+    wait_for(page, f"return axial.clientWidth < {stage_width / 2} && clrecon.facts.settled")
 
     point_at(page, "axial", scenes.middle(0))
 
