@@ -193,7 +193,8 @@ def _find_platforms() -> list[Any]:
     try:
         cl = quirks.import_pyopencl()
     except ImportError as error:
-        raise DeviceError(f"pyopencl cannot be imported ({error}): reinstall clrecon") from error
+        advice = "install it again, or a missing loader (libOpenCL) with `apt install ocl-icd-libopencl1`"
+        raise DeviceError(f"pyopencl cannot be imported ({error}): {advice}") from error
     limit = _address_space()
     if limit is not None and limit < _LEAST_ADDRESS_SPACE:
         raise DeviceError(

@@ -12,7 +12,7 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 101_900,
+    "lines": 101_898,
     "modules": 440,
     "small_modules_with_one_reader": 7,
     "docstrings_with_raises": 139,

@@ -81,6 +81,7 @@ def test_devices_without_pyopencl_are_a_device_error_that_names_it(tmp_path: Pat
     done = run_python(f"{NO_PYOPENCL}\nimport clrecon\nclrecon.devices()", tmp_path)
     assert done.returncode == 1
     assert "DeviceError: pyopencl cannot be imported" in done.stderr.splitlines()[-1]
+    assert "apt install ocl-icd-libopencl1" in done.stderr.splitlines()[-1]
 
 
 @pytest.mark.parametrize("name", clrecon.__all__)

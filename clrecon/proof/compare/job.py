@@ -10,7 +10,6 @@ import os
 import re
 from collections.abc import Iterator, Sequence
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -137,18 +136,16 @@ def make_comparison(
 
 def choose_installed(settings: CompareSettings) -> tuple[list[Compared], list[str]]:
     """Return the methods whose packages are installed, and a line on what is left out; named methods must be there."""
-    absent: dict[str, list[str]] = {}
+    absent: dict[str, list[str]] = {} if is_installed("matplotlib") else {"matplotlib": ["plots"]}
     chosen = choose_methods(settings.methods, settings.reference)
-    needs = [(method.name, method.module) for method in chosen if method.module]
-    for name, module in (*needs, ("plots", "matplotlib")):
-        if not is_installed(module):
-            if name in (*settings.methods, settings.reference):
-                raise missing_package(module, f"the method {name}")
-            absent.setdefault(package_of(module), []).append(name)
-    lacking = ", ".join(f"{list_names(names)} ({package})" for package, names in absent.items())
-    left_out = [f"left out, their packages are not installed: {lacking}"] if absent else []
-    unavailable = set(chain(*absent.values()))
-    return [method for method in chosen if method.name not in unavailable], left_out
+    lacking = [method for method in chosen if method.module and not is_installed(method.module)]
+    for method in lacking:
+        if method.name in (*settings.methods, settings.reference):
+            raise missing_package(method.module, f"the method {method.name}")
+        absent.setdefault(package_of(method.module), []).append(method.name)
+    names = ", ".join(f"{list_names(names)} ({package})" for package, names in absent.items())
+    left_out = [f"left out, their packages are not installed: {names}"] if absent else []
+    return [method for method in chosen if method not in lacking], left_out
 
 
 def _check_truth(path: Path) -> str:
