@@ -99,12 +99,12 @@ def measure_fitted(phantom: Phantom, volume: Volume, profiles: Profiles, surface
     errors, rows = find_on_mesh(profiles, mesh.vertices, mesh.triangles)
     said = np.where(rows >= 0, mesh.values["error_mm"][mesh.triangles[rows, 0]], np.nan)
     known = np.isfinite(said) & np.isfinite(errors)
-    within = [float(np.mean(np.abs(errors[known]) <= times * said[known])) for times in (1.0, 1.96)]
+    names = {"within_error": 1.0, "within_196_errors": 1.96} if known.any() else {}
+    within = {name: np.mean(np.abs(errors[known]) <= times * said[known]) for name, times in names.items()}
     constants = mesh.report["cortex"]["constants"]
     return {
         **describe_errors(errors, level, phantom.scale),
-        "within_error": round(within[0], 4),
-        "within_196_errors": round(within[1], 4),
+        **{name: round(float(share), 4) for name, share in within.items()},
         **{name: round(float(constants[name]), 3) for name in ("blur_mm", "blur_across_mm", "cortex_hu")},
         "seconds": round(seconds, 2),
         "triangles": mesh.triangle_count,
