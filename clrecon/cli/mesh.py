@@ -242,9 +242,9 @@ def describe_cortex(meshes: list[dict[str, Any]]) -> list[str]:
     if not cortex["moved"]:
         return [f"cortex   lies {abs(outside['mean']):.2f} mm {side} of the bone ({ends}), measured at {share:.0f} %"]
     return [
-        f"cortex   {share:.0f} % of the vertices lie on the bone, {abs(outside['mean']):.2f} mm {side} of the level"
-        f" ({ends}); error {error['p50']:.2f} mm (95 %: {error['p95']:.2f}), of all {cortex['bias_mm']:.2f}; walls"
-        f" {walls['p50']:.1f} mm ({walls['p5']:.1f} to {walls['p95']:.1f})"
+        f"cortex   {share:.0f} % of the vertices are fitted to the bone, {abs(outside['mean']):.2f} mm {side} of the"
+        f" level ({ends}); error {error['p50']:.2f} mm (95 %: {error['p95']:.2f}), of the whole surface"
+        f" {cortex['bias_mm']:.2f}; walls {walls['p50']:.1f} mm ({walls['p5']:.1f} to {walls['p95']:.1f})"
     ]
 
 

@@ -14,7 +14,7 @@ from clrecon.cli import common
 from clrecon.cli.console import Console, printable
 from clrecon.cli.view import draw_view
 from clrecon.errors import UsageError
-from clrecon.jobs.inputs import CLOUD_INPUTS, MESH_INPUTS, is_cloud_file, is_only_mesh
+from clrecon.jobs.inputs import CLOUD_INPUTS, MESH_INPUTS, holds_triangles, is_cloud_file
 from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.jobs.options import InputSettings, preset_option
 from clrecon.jobs.render.settings import (
@@ -233,8 +233,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             _EXAMPLES,
         )
     )
-    others = f"a cloud of points ({', '.join(CLOUD_INPUTS)}); or a mesh ({', '.join(MESH_INPUTS)}; of .ply and .vtp say"
-    text = f"{common.SCAN_FOLDER}; {common.GRID_FILE}; {others} --mode mesh); may be left out with --mesh"
+    others = f"a cloud of points ({', '.join(CLOUD_INPUTS)}); or a mesh ({', '.join(MESH_INPUTS)})"
+    text = f"{common.SCAN_FOLDER}; {common.GRID_FILE}; {others}; may be left out with --mesh"
     common.add_input(parser, text, nargs="?")
     common.add_output(
         parser, "picture: .png, .jpg, .tif, .svg (letters as text); may be left out with --turntable", required=False
@@ -297,10 +297,11 @@ def run(options: argparse.Namespace, console: Console) -> int:
     if options.input is None:
         _show_meshes_alone(options)
     files = PictureFiles(options.output, options.depth, options.values, options.turntable, options.report)
-    if options.mode is None and (options.color in MESH_COLORS or is_only_mesh(options.input)):
-        options.mode = "mesh"
     if options.mode is None and is_cloud_file(options.input):
-        options.mode = "points"
+        asks_points = options.color in POINT_COLORS or options.radius_mm is not None
+        options.mode = "mesh" if holds_triangles(options.input) and not asks_points else "points"
+    if options.mode is None and (options.color in MESH_COLORS or holds_triangles(options.input)):
+        options.mode = "mesh"
     report = make_pictures(
         options.input, files, render_settings(options), no_clobber=options.no_clobber, progress=console.progress
     )

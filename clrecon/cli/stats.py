@@ -104,7 +104,7 @@ def _lay_out_surfaces(labels: Sequence[dict[str, Any]]) -> list[str]:
             cells.append("none" if share is None else f"{100.0 * share:.0f} %")
         rows.append([printable(label["name"]), *cells])
     kind = "moved onto the bone from" if fitted else "at"
-    units = "; walls and their error in mm, share of the vertices that lie on the bone" if fitted else ""
+    units = "; walls and their error in mm, share of the vertices fitted to the bone" if fitted else ""
     text = f"surface  {kind} {of[0]['iso_value_hu']:g} HU, filled{units}"
     return ["", text, *common.table([head, *rows], range(1, 8))]
 

@@ -204,9 +204,19 @@ def read_cloud(path: Path) -> RawCloud:
         np.stack([columns.pop(axis) for axis in ("x", "y", "z")], axis=1),
         columns,
         warnings=[f"elements left out: {', '.join(others)}"] if others else [],
-        has_faces=any(each.name == "face" and each.count for each in header.elements),
+        has_faces=_count_faces(header) > 0,
         **read_remarks(header.comments),
     )
+
+
+def has_faces(path: Path) -> bool:
+    """True for a file whose header counts faces."""
+    with open_regular(path) as stream:
+        return _count_faces(read_header(stream, escape_text(path.name))) > 0
+
+
+def _count_faces(header: Header) -> int:
+    return sum(each.count for each in header.elements if each.name == "face")
 
 
 def read_header(stream: BinaryIO, name: str) -> Header:

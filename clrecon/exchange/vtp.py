@@ -293,7 +293,7 @@ def _read_document(path: Path, collect: Callable[[Document, str], Raw]) -> Raw:
         raise say_cut(name, error) from error
 
 
-def has_polygons(path: Path) -> bool:
+def has_faces(path: Path) -> bool:
     """True for a file whose XML counts polygons; its arrays are not looked at."""
     with open_regular(path) as stream:
         start = stream.read(vtk_xml.LONGEST_TEXT)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
-from clrecon.exchange.formats import CLOUD_INPUTS, MESH_INPUTS
+from clrecon.exchange.formats import CLOUD_INPUTS, FORMATS, MESH_INPUTS
 from clrecon.jobs.options import InputSettings, changed_fields
 from clrecon.reading.urls import refuse_url
 from clrecon.system.arguments import name_parameter
@@ -34,10 +34,12 @@ def is_cloud_file(source: str | Path) -> bool:
     return extension_of(source) in CLOUD_INPUTS and not os.path.isdir(source)
 
 
-def is_only_mesh(source: str | Path) -> bool:
-    """True for a file, or the name of one, whose extension only meshes have; that of PLY is one of clouds too."""
+def holds_triangles(source: str | Path) -> bool:
+    """True for a mesh by its extension; for a PLY or VTP file, which may be a cloud, by the faces that it counts."""
     extension = extension_of(source)
-    return extension in MESH_INPUTS and extension not in CLOUD_INPUTS and not os.path.isdir(source)
+    if extension not in MESH_INPUTS or os.path.isdir(source):
+        return False
+    return extension not in CLOUD_INPUTS or (os.path.isfile(source) and FORMATS[extension].code.has_faces(Path(source)))
 
 
 def may_be_mesh(source: str | Path) -> bool:

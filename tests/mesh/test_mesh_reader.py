@@ -16,7 +16,7 @@ from clrecon import Mesh
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.exchange.formats import MESH_INPUTS
 from clrecon.exchange.stl import join_corners
-from clrecon.exchange.vtp import has_polygons
+from clrecon.exchange.vtp import has_faces
 
 RADIUS_MM = 8.0
 BALL = Mesh(*ball(RADIUS_MM, rings=12))
@@ -117,7 +117,7 @@ def test_only_scalars_of_a_ply_whose_name_is_plain_become_values(tmp_path: Path)
 def test_polygons_of_a_vtp_are_looked_for_in_the_first_mebibyte(tmp_path: Path, beyond: int, found: bool) -> None:
     mark = b'NumberOfPolys="1"'
     (tmp_path / "a.vtp").write_bytes(bytes(2**20 - len(mark) + beyond) + mark + bytes(9))
-    assert has_polygons(tmp_path / "a.vtp") == found
+    assert has_faces(tmp_path / "a.vtp") == found
 
 
 CORNERS = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 0, 0), (-0.0, 0, 0), (0, 1, 1)], np.float32)

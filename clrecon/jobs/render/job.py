@@ -17,7 +17,7 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.certificate import amend
 from clrecon.jobs.devices import list_usable
-from clrecon.jobs.inputs import describe_cloud, is_cloud_file, is_only_mesh, read_with_labels, refuse_scan_settings
+from clrecon.jobs.inputs import describe_cloud, holds_triangles, is_cloud_file, read_with_labels, refuse_scan_settings
 from clrecon.jobs.outputs import check_distinct, check_files, check_kept
 from clrecon.jobs.preprocess import Band, mask_volume, preprocess_volume, restrict_volume
 from clrecon.jobs.render.picture_taker import Beside, PictureTaker, read_curve, read_function, read_look
@@ -329,16 +329,13 @@ def _check_kind(source: str | Path, settings: RenderSettings) -> None:
         refuse_scan_settings(settings, noun="a mesh")
         return
     is_cloud = is_cloud_file(source)
-    if is_only_mesh(source):
-        raise UsageError(f"the input is a mesh, which mode mesh shows, and not mode {settings.mode}")
-    if is_cloud != (settings.mode == "points"):
-        raise UsageError(
-            f"the input is a cloud of points, which mode points shows, and not mode {settings.mode}"
-            if is_cloud
-            else "mode points shows a file of points, and the input is none: make a cloud of it first"
-        )
-    if is_cloud:
+    if is_cloud and settings.mode == "points":
         refuse_scan_settings(settings)
+    elif is_cloud or holds_triangles(source):
+        kind, mode = ("a mesh", "mesh") if holds_triangles(source) else ("a cloud of points", "points")
+        raise UsageError(f"the input is {kind}, which mode {mode} shows, and not mode {settings.mode}")
+    elif settings.mode == "points":
+        raise UsageError("mode points shows a file of points, and the input is none: make a cloud of it first")
 
 
 def _read_input(source: str | Path, run: Run) -> tuple[Volume | PointCloud | Mesh, LabelMap | None]:

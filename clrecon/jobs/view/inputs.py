@@ -11,7 +11,7 @@ from clrecon.errors import RefusedInputError, UsageError
 from clrecon.exchange.formats import MESH_INPUTS
 from clrecon.geometry import Volume
 from clrecon.jobs.distance import read_side
-from clrecon.jobs.inputs import crop_labels, is_cloud_file, refuse_other_clouds
+from clrecon.jobs.inputs import crop_labels, holds_triangles, is_cloud_file, refuse_other_clouds
 from clrecon.jobs.mesh.labels import open_labels
 from clrecon.jobs.options import InputSettings, changed_fields
 from clrecon.jobs.preprocess import mask_volume, preprocess_volume, restrict_volume
@@ -115,17 +115,7 @@ def _tell_kind(path: str | Path) -> str:
         return "scan"
     if not file.is_file():
         raise UsageError(f"{escape_text(str(path), 200)}: there is no file of that name")
-    if suffix == ".vtp":
-        from clrecon.exchange.vtp import has_polygons
-
-        return "mesh" if has_polygons(file) else "cloud"
-    if suffix == ".ply":
-        from clrecon.exchange.ply import read_header
-
-        with file.open("rb") as stream:
-            elements = read_header(stream, escape_text(file.name)).elements
-        return "mesh" if any(each.name == "face" and each.count for each in elements) else "cloud"
-    return "mesh" if suffix in MESH_INPUTS else "cloud"
+    return "mesh" if holds_triangles(file) else "cloud"
 
 
 def _describe_frame(name: str, file: dict[str, Any]) -> tuple[str, ...]:

@@ -338,7 +338,7 @@ class Stage(DeviceWorker):
                     self._fits.popitem(last=False)
             share, walls = 100.0 * cortex["fitted"] / cortex["vertices"], cortex["thickness_mm"]["p50"]
             lines.append(
-                f"{self._name(key[0])}: {share:.0f} % of the vertices lie on the bone, error"
+                f"{self._name(key[0])}: {share:.0f} % of the vertices are fitted to the bone, error"
                 f" {cortex['error_mm']['p50']:.2f} mm, walls {walls:.1f} mm (median)"
             )
         return lines

@@ -179,11 +179,15 @@ def test_volume_or_folder_is_not_taken_for_a_cloud(tmp_path: Path) -> None:
     assert not is_cloud_file(tmp_path / "scan.ply")
 
 
-def test_mesh_drawn_as_points_is_warned_of_with_the_mode_that_draws_its_faces(
-    device: Any, tmp_path: Path, printed: Printer
+@pytest.mark.parametrize("extension", [".ply", ".vtp"])
+def test_mesh_of_a_format_of_clouds_is_drawn_as_points_only_where_an_option_asks_for_them(
+    device: Any, tmp_path: Path, printed: Printer, extension: str
 ) -> None:
     vertices = np.array([(0.0, 0.0, 0.0), (9.0, 0.0, 0.0), (0.0, 9.0, 0.0)])
-    clrecon.Mesh(vertices, np.array([(0, 1, 2)])).save(tmp_path / "bone.ply")
-    files = [str(tmp_path / "bone.ply"), "-o", str(tmp_path / "a.png")]
+    clrecon.Mesh(vertices, np.array([(0, 1, 2)])).save(tmp_path / f"bone{extension}")
+    files = [str(tmp_path / f"bone{extension}"), "-o", str(tmp_path / "a.png")]
     assert main(["render", *files, "--size", SIZE, "--device", str(device.index)]) == 0
-    printed().assert_error("--mode", "mesh")
+    printed().assert_output("mode", "mesh")
+    for asked in (["--mode", "points"], ["--point-radius", "1"]):
+        assert main(["render", *files, *asked, "--size", SIZE, "--device", str(device.index)]) == 0
+        printed().assert_error("--mode", "mesh")

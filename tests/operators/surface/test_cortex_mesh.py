@@ -315,7 +315,7 @@ def test_command_with_surface_cortex_moves_the_vertices_onto_the_bone_and_says_s
     report_file = tmp_path / "a.json"
     output = ("-o", tmp_path / "a.ply", "--report", report_file)
     assert run_mesh_command(ct_file, *output, "--surface", "cortex") == 0
-    assert "vertices lie on the bone" in printed().everything
+    assert "vertices are fitted to the bone" in printed().everything
     report = read_report(report_file)
     assert report["cortex"]["moved"]
     assert report["seconds"]["cortex"] > 0.0

@@ -78,7 +78,7 @@ def test_a_fit_is_announced_lies_on_the_bone_and_is_taken_back(open_session) -> 
     assert picked_radius(view) > AT_ISO_MM
     assert "fitting the surface to the bone" in view.do({"do": "toggle_fitted"})["busy"]
     assert view.wait(PATIENCE)
-    assert view.facts()["fitted"] is True and "vertices lie on the bone" in view.facts()["said"]
+    assert view.facts()["fitted"] is True and "vertices are fitted to the bone" in view.facts()["said"]
     assert picked_radius(view) == pytest.approx(RADIUS_MM, abs=0.15)
     assert do(view, "toggle_fitted")["fitted"] is False
     assert picked_radius(view) > AT_ISO_MM
