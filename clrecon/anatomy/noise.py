@@ -12,6 +12,7 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.light_dataclass import dataclass
+from clrecon.system.pieces import list_distinct
 
 SOFT_TISSUE_HU = (-150.0, 250.0)
 """Blocks for measuring noise lie in this range: fat, muscle, organs with up to 60 HU of noise; no air or dense bone."""
@@ -67,7 +68,7 @@ def measure_noise(volume: Volume) -> Noise:
         There are fewer than 50 blocks of soft tissue.
     """
     nk = volume.shape_ijk[2]
-    ks = np.unique(np.linspace(0, nk - 1, min(nk, MOST_SLICES)).round().astype(int)).tolist()
+    ks = list_distinct(np.linspace(0, nk - 1, min(nk, MOST_SLICES)).round().astype(int)).tolist()
     deviations = np.concatenate([_block_deviations(volume.voxels[k]) for k in ks])
     if len(deviations) < _FEWEST_BLOCKS:
         low, high = SOFT_TISSUE_HU

@@ -14,12 +14,12 @@ from typing import Any
 
 from clrecon.errors import UsageError
 
-_UNUSED = ("requests", "PIL")
-"""What pydicom imports and reading does not need; it takes as long as pydicom itself."""
+_UNUSED = ("requests", "PIL", "attrs")
+"""What pydicom and pytools import where it is installed, and reading and devices do not need."""
 
 
 def hide_unused() -> None:
-    """Hide modules from pydicom by None in `sys.modules`, in a process of our own, until `show_unused`."""
+    """Hide modules by None in `sys.modules`, in a process of our own, until `show_unused`."""
     for name in _UNUSED:
         sys.modules.setdefault(name, None)  # type: ignore[arg-type]
 

@@ -54,7 +54,7 @@ _Other = TypeVar("_Other")
 def side_by_side(in_pool: Callable[[], _One], on_this_thread: Callable[[], _Other]) -> tuple[_One, _Other]:
     """Call two functions at once, the first in a thread; what one of them raises is raised after both have ended."""
     with ThreadPoolExecutor(1) as pool:
-        first = pool.submit(in_pool)
+        first = pool.submit(copy_context().run, in_pool)
         second = on_this_thread()
         return first.result(), second
 
@@ -101,8 +101,8 @@ def spread_rows(count: int, most: int) -> NDArray[np.int64]:
     return np.linspace(0, count - 1, min(count, most)).astype(np.int64)
 
 
-def list_distinct(numbers: NDArray[np.integer[Any]]) -> NDArray[Any]:
-    """Return the distinct whole numbers of an array, rising: `numpy.unique` of 2.3 hashes them, which takes longer."""
+def list_distinct(numbers: NDArray[Any]) -> NDArray[Any]:
+    """Return the distinct numbers of an array, rising: `numpy.unique` of 2.3 hashes them, and loads masked arrays."""
     ordered = np.sort(numbers, axis=None)
     return ordered[np.append(True, ordered[1:] != ordered[:-1])[: len(ordered)]]
 

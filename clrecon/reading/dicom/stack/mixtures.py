@@ -21,6 +21,7 @@ from clrecon.reading.dicom.parse.plain import CorruptFileError, NotDicomError
 from clrecon.reading.dicom.parse.values import name_element
 from clrecon.reading.dicom.stack.fit import median
 from clrecon.system.light_dataclass import dataclass
+from clrecon.system.pieces import list_distinct
 
 _CERTAIN = (
     "TemporalPositionIndex",
@@ -363,7 +364,7 @@ def _code(tag: int, column: Sequence[bytes]) -> Iterator[tuple[list[int], bool]]
         return
     known = [number for number in numbers if number is not None]
     if len(known) == len(column):
-        ordered = np.unique(known)
+        ordered = list_distinct(np.array(known))
         steps = np.argsort(-np.diff(ordered), kind="stable")
         for heaps in range(2, min(_MOST_HEAPS, len(ordered)) + 1):
             yield np.searchsorted(np.sort(ordered[steps[: heaps - 1]]), known).tolist(), True
