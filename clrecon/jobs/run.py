@@ -339,13 +339,13 @@ class Run(Laps):
         allow_open_files(len(meshes))
         staged: list[StagedFile] = []
         for mesh, path in zip(meshes, paths, strict=True):
-            self.progress("write", len(staged), len(meshes) if len(meshes) > 1 else 0)
+            if len(meshes) > 1:
+                self.progress("write", len(staged), len(meshes))
             staged.append(self.stage(stage_mesh(mesh, path, self.settings.space, keep_ids=self._keep_ids)))
         return staged
 
     def write_together(self, meshes: Sequence[Mesh], path: str | Path) -> StagedFile:
         """Write all meshes as named objects of one file under a temporary name."""
-        self.progress("write", 0, 0)
         return self.stage(stage_assembly(meshes, path, self.settings.space, keep_ids=self._keep_ids))
 
     def certificate(self, volume: Volume) -> dict[str, Any]:

@@ -36,7 +36,7 @@ from clrecon.system.arguments import name_parameter
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.log import get_logger
 from clrecon.system.paths import extension_of
-from clrecon.system.pieces import find_bounds
+from clrecon.system.pieces import find_bounds, side_by_side
 from clrecon.system.text import count_of
 
 if TYPE_CHECKING:
@@ -310,34 +310,19 @@ def make_mesh(
             for part, path in zip(parts, paths, strict=True):
                 check_triangles(part.mesh.triangle_count, path)
         is_measured = settings.strict or (report_path is not None if measure is None else measure)
-        label = partial(label_part, device=result.device, settings=settings, measure=is_measured)
-        judge_surfaces(parts, result.volume, settings, label)
-        run.lap("select")
-        gates = _refine_and_measure(run, result, is_measured)
-        warnings = [
-            *warn_of_crumbs(parts, settings),
-            *warn_of_shift(parts, settings),
-            *describe_purposes(parts, settings, result.volume, result.device),
-            *warn_of_gates(gates),
-        ]
-        run.lap("measure")
-        meshes = [part.mesh for part in parts]
-        if settings.one_file:
-            from clrecon.rendering.pictures.label_style import distinct_colors
-
-            for part, color in zip(parts, distinct_colors(len(parts)), strict=True):
-                given = part.mesh.report
-                given["part_name"] = part.name or given.get("part_name")
-                given.setdefault("color", [float(value) for value in color])
-            files = [run.write_together(meshes, output)] * len(parts)
-        else:
-            files = run.write_meshes(meshes, paths)
+        judge = partial(_judge_parts, run, result, is_measured)
+        write = partial(_write_parts, run, parts, output, paths)
+        if (len(parts) > 1 and not settings.one_file) or settings.refines or settings.surface == "cortex":
+            gates, warnings = judge()
+            files = write()
+        else:  # beside, since one file of final meshes tells no progress
+            files, (gates, warnings) = side_by_side(write, judge)
         run.lap("write")
         walls = warn_of_walls(parts, settings, result.choice)
         left = _warn_of_leftovers(output, paths) if settings.split else []
         entries = [describe_part(*each, settings.space) for each in zip(parts, files, paths, strict=True)]
         is_modified = settings.refines or settings.solid or settings.surface == "cortex"
-        stored = None if target is None else target.store_meshes(meshes, is_modified=is_modified)
+        stored = None if target is None else target.store_meshes([part.mesh for part in parts], is_modified=is_modified)
         report = report_of(run, result, entries, gates, [*left, *walls, *warnings], stored)
         run.finish(report, report_path)
     return _log_report(report)
@@ -441,13 +426,41 @@ def makes_objects(output: str | Path) -> bool:
     return extension_of(output) == ".3mf"
 
 
-def _refine_and_measure(run: Run, result: MadeParts, measure: bool) -> list[dict[str, Any]]:
-    settings: MeshSettings = run.settings
+def _judge_parts(run: Run, result: MadeParts, measure: bool) -> tuple[list[dict[str, Any]], list[str]]:
+    """Judge the parts as they are, refine and measure them; return gates and warnings."""
+    parts, settings = result.parts, run.settings
+    label = partial(label_part, device=result.device, settings=settings, measure=measure)
+    judge_surfaces(parts, result.volume, settings, label)
+    run.lap("select")
     place_on_cortex(result, settings, measure, run.progress)
     run.lap("cortex")
     refine_and_measure(result, settings, measure, run.lap, run.progress)
-    gates = judge_parts(result.parts, settings)
-    return gates + (judge_label_volumes(result.parts, settings.closed) if settings.labels_pick else [])
+    gates = judge_parts(parts, settings)
+    if settings.labels_pick:
+        gates += judge_label_volumes(parts, settings.closed)
+    warnings = [
+        *warn_of_crumbs(parts, settings),
+        *warn_of_shift(parts, settings),
+        *describe_purposes(parts, settings, result.volume, result.device),
+        *warn_of_gates(gates),
+    ]
+    run.lap("measure")
+    run.progress("write", 0, 0)
+    return gates, warnings
+
+
+def _write_parts(run: Run, parts: Sequence[Part], output: str | Path, paths: Sequence[str | Path]) -> list[StagedFile]:
+    """Write the parts, with ``one_file`` together; return the file of each."""
+    meshes = [part.mesh for part in parts]
+    if not run.settings.one_file:
+        return run.write_meshes(meshes, paths)
+    from clrecon.rendering.pictures.label_style import distinct_colors
+
+    for part, color in zip(parts, distinct_colors(len(parts)), strict=True):
+        given = part.mesh.report
+        given["part_name"] = part.name or given.get("part_name")
+        given.setdefault("color", [float(value) for value in color])
+    return [run.write_together(meshes, output)] * len(parts)
 
 
 def _warn_of_leftovers(output: str | Path, paths: Sequence[str | Path]) -> list[str]:

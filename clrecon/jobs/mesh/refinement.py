@@ -215,21 +215,18 @@ def refine_and_measure(
         if measure:
             measure_parts(parts, result.solid([part.mesh for part in parts]), settings, result.device, progress)
             lap("measure")
-        again = [(part, mesh) for part, mesh in zip(parts, extracted, strict=False) if _lies_too_far(part, settings)]
-        for part, mesh in again:
-            part.mesh = mesh
-        parts = [part for part, _ in again]
-        if not parts:
+        again = []
+        for part, mesh in zip(parts, extracted, strict=False):
+            if any(gate.ok is False for gate in _judge_part(part, settings) if gate.name in _JUDGED_AS_FAR):
+                part.mesh = mesh
+                again.append(part)
+        if not (parts := again):
             break
 
 
 def _is_tightened(settings: MeshSettings) -> bool:
     bounded = settings.decimate_used is not None and settings.method != "g-mc"
     return settings.is_for_print and bounded and settings.max_deviation_mm is None
-
-
-def _lies_too_far(part: Part, settings: MeshSettings) -> bool:
-    return any(gate.ok is False for gate in _judge_part(part, settings) if gate.name in _JUDGED_AS_FAR)
 
 
 def measure_parts(

@@ -72,6 +72,7 @@ def write_view(
             pair = [{**own, "bounds_mm": own["bounds_mm"].tolist()} for own in (placed[0][1], entry)]
             doubts += doubt_frames([placed[0][0], mesh], pair)
         warnings = [*chain(*(one.warnings for one in shown)), *doubts]
+        run.progress("write", 0, 0)
         file = run.write_meshes(meshes, [output])[0] if len(meshes) == 1 else run.write_together(meshes, output)
         run.lap("write")
         commit_all(run.files)
