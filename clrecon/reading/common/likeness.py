@@ -9,7 +9,6 @@ noise, are compared over the whole picture and in small parts of it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 
 from clrecon.geometry.affine import TILT_REPORT_DEG
 from clrecon.system.light_dataclass import dataclass, replace
-from clrecon.system.pieces import count_readers
+from clrecon.system.pieces import chunks, in_threads
 from clrecon.system.records import Gate, none_of, unmeasured
 
 _LEAST_LIKENESS = 1.25
@@ -48,7 +47,8 @@ PART = 8
 """Cells along the side of a part of the picture."""
 _NOISE_HU2, _PART_NOISE_HU2 = 1.0, 25.0
 """Lower limits of squared differences: pictures without noise are alike by chance."""
-READERS = 4
+_PIECE, _CACHED = 8, 1 << 17
+"""Slices that a thread takes at a time, and cells whose differences are taken at a time."""
 WINDOW, WINDOWS = 32, 3
 """Number of slices in a window, and windows examined, in an evenly spaced stack with more slices: interleaved volumes
 are interleaved from end to end, so parts of the picture must show it in two windows."""
@@ -141,20 +141,16 @@ def measure_likeness(voxels: NDArray[Any], *, parts: bool = True) -> Likeness | 
 def _compare_cells(
     cells: NDArray[np.float32], step: int, *, parts: bool
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the mean squared differences of slices `step` apart, (n,), and those of `parts` of the picture, or none.
-
-    Slice by slice: the differences stay in the cache of the processor.
-    """
+    """Return the mean squared differences of slices `step` apart, (n,), and those of `parts` of the picture or none."""
     count = max(len(cells) - step, 0)
     whole = np.empty(count, np.float32)
     tiles = np.empty((count, *(side // PART * parts for side in cells.shape[1:])), np.float32)
-    apart = np.empty(cells.shape[1:], np.float32)
-    for k in range(count):
-        np.subtract(cells[k + step], cells[k], out=apart)
+    for piece in chunks(count, max(1, _CACHED // cells[0].size)):
+        apart = cells[step:][piece] - cells[piece]
         np.square(apart, out=apart)
-        whole[k] = apart.mean()
+        whole[piece] = apart.mean(axis=(1, 2))
         if parts:
-            tiles[k] = _average(apart, PART)
+            tiles[piece] = _average(apart, PART)
     return whole, tiles
 
 
@@ -183,30 +179,32 @@ def _average_cells(voxels: NDArray[Any]) -> NDArray[np.float32]:
     cells = np.empty((len(voxels), rows, columns), np.float32)
     word, ones = np.dtype(f"u{2 * side}"), sum(1 << 16 * place for place in range(side))
 
-    def average(k: int) -> None:
-        picture = np.empty((rows * side, columns * side), np.int16)
-        np.clip(voxels[k, : rows * side, : columns * side], *HU_RANGE, out=picture, casting="unsafe")
-        picture -= HU_RANGE[0]
-        band = picture[::side].copy()
-        for row in range(1, side):
-            band += picture[row::side]
-        # A cell's pixels of a row of sums are one word: this product has their sum in its highest 16 bits.
-        words = band.view(word) * word.type(ones)
-        cells[k] = words >> word.type(16 * (side - 1))
+    def average(piece: slice) -> None:
+        picture = np.empty((rows * side, columns * side), np.int16)  # new memory a slice takes as long as the rest
+        band = np.empty((rows, columns * side), np.int16)
+        words = band.view(word)
+        for slice_cells, layer in zip(cells[piece], voxels[piece, : rows * side, : columns * side], strict=True):
+            np.clip(layer, *HU_RANGE, out=picture, casting="unsafe")
+            picture -= HU_RANGE[0]
+            band[...] = picture[::side]
+            for row in range(1, side):
+                band += picture[row::side]
+            # A cell's pixels of a row of sums are one word: this product has their sum in its highest 16 bits.
+            words *= word.type(ones)
+            words >>= word.type(16 * (side - 1))
+            slice_cells[...] = words
 
-    with ThreadPoolExecutor(count_readers(len(voxels), READERS)) as pool:
-        for _ in pool.map(average, range(len(voxels))):
-            pass
+    in_threads(average, len(voxels), _PIECE)
     cells += side * side * HU_RANGE[0]
     cells /= side * side
     return cells
 
 
-def _average(picture: NDArray[np.float32], side: int) -> NDArray[np.float32]:
-    """Average over squares of a picture (rows, columns), leaving out the rest at the ends."""
-    rows, columns = picture.shape[0] // side, picture.shape[1] // side
-    bands = picture[: rows * side, : columns * side].reshape(rows, side, columns * side).sum(axis=1)
-    return np.asarray(bands.reshape(rows, columns, side).sum(axis=2) / np.float32(side * side))
+def _average(pictures: NDArray[np.float32], side: int) -> NDArray[np.float32]:
+    """Average over squares of pictures (n, rows, columns), leaving out the rest at the ends."""
+    count, (rows, columns) = len(pictures), (length // side for length in pictures.shape[1:])
+    bands = pictures[:, : rows * side, : columns * side].reshape(count, rows, side, columns * side).sum(axis=2)
+    return np.asarray(bands.reshape(count, rows, columns, side).sum(axis=3) / np.float32(side * side))
 
 
 SHOWN_SAID = "pictures that are not where their headers put them: slices in each other's place, rows of a wrong length"
@@ -249,15 +247,12 @@ def _sample_rows(voxels: NDArray[Any]) -> NDArray[np.int16]:
     rows = range(side // 2, nj, side)
     samples = np.empty((nk, len(rows) * (ni // side)), np.int16)
 
-    def sample(k: int) -> None:
-        chosen = np.clip(voxels[k, side // 2 :: side, : ni // side * side], *HU_RANGE)
-        exact = np.int32 if chosen.dtype.kind == "i" else chosen.dtype
-        sums = sum(chosen[:, place::side].astype(exact) for place in range(side))
-        np.rint(sums.ravel() / side, out=samples[k], casting="unsafe")
+    def sample(piece: slice) -> None:
+        for means, layer in zip(samples[piece], voxels[piece, side // 2 :: side, : ni // side * side], strict=True):
+            sums = np.clip(layer, *HU_RANGE).astype(np.float64).reshape(-1, side) @ np.ones(side)  # exact for integers
+            np.rint(sums / side, out=means, casting="unsafe")
 
-    with ThreadPoolExecutor(count_readers(nk, READERS)) as pool:
-        for _ in pool.map(sample, range(nk)):
-            pass
+    in_threads(sample, nk, _PIECE)
     return samples
 
 

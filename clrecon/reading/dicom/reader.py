@@ -42,6 +42,7 @@ from clrecon.reading.dicom.stack.fit import Stack, measure_extent, median_thickn
 from clrecon.system.arguments import name_parameter
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.paths import open_regular
+from clrecon.system.pieces import side_by_side
 from clrecon.system.progress import Progress
 from clrecon.system.text import escape_text, hash_uid, join_names
 
@@ -208,8 +209,10 @@ def _certify_chosen(
 
 def _read_pixels(stack: Stack, progress: Progress | None) -> SeriesPixels:
     voxels, facts = read_voxels(stack.slices, progress)
-    likeness = judge_slices(voxels, stack.tilt_deg, uneven=stack.line.uneven)
-    findings = examine_voxels(voxels, facts, stack.slices, known=not count_unknown(stack.slices))
+    likeness, findings = side_by_side(
+        lambda: judge_slices(voxels, stack.tilt_deg, uneven=stack.line.uneven),
+        lambda: examine_voxels(voxels, facts, stack.slices, known=not count_unknown(stack.slices)),
+    )
     return SeriesPixels(voxels, facts, likeness, findings)
 
 
