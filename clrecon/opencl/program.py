@@ -7,7 +7,6 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -185,16 +184,10 @@ def building_together(device: Device) -> Iterator[None]:
             device.programs.update({(name, _options_of(device, files[name])): program for name in files})
 
 
-@cache
-def _macros_of(name: str) -> frozenset[str]:
-    """Return the capital words of a kernel file that are there when the preprocessor begins."""
-    return frozenset(re.findall(r"\b[A-Z][A-Z0-9_]+\b", read_kernel_source(name)))
-
-
 def _check_united(united: Mapping[str, str], files: Mapping[str, Mapping[str, str]]) -> None:
     for name, variants in files.items():
-        changed = {macro for macro in united.keys() & _macros_of(name) if variants.get(macro) != united[macro]}
-        if changed:
+        different = (macro for macro in united if variants.get(macro) != united[macro])
+        if changed := {macro for macro in different if re.search(rf"\b{macro}\b", read_kernel_source(name))}:
             raise AssertionError(f"cl/{name} would be built with {', '.join(sorted(changed))} of another file")
 
 
