@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import argparse
-import io
 import os
+import re
 import shutil
 import sys
 import textwrap
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from itertools import groupby, zip_longest
+from typing import Any
+from unicodedata import combining, east_asian_width
 
 from clrecon.cli import common
 from clrecon.cli.console import Console, is_terminal, printable
 from clrecon.jobs.settings import InfoSettings
 from clrecon.system.light_dataclass import dataclass
-
-if TYPE_CHECKING:
-    from rich.table import Table
-
 
 _DIRECTIONS = {"L": "left", "R": "right", "P": "back", "A": "front", "S": "head", "I": "feet"}
 _FIRST = {"HF": "head first", "FF": "feet first"}
@@ -175,18 +173,30 @@ class _Column:
     @property
     def width(self) -> int:
         """Width of the column in characters; a column that folds needs at most `_FOLDED_WIDTH`."""
-        from rich.cells import cell_len
-
-        longest = max((cell_len(cell) for cell in self.cells), default=0)
-        return max(cell_len(self.heading), min(longest, _FOLDED_WIDTH) if self.folds else longest)
+        longest = max(map(_width, self.cells), default=0)
+        return max(_width(self.heading), min(longest, _FOLDED_WIDTH) if self.folds else longest)
 
 
-class _Sink(io.StringIO):
-    """The stream that rich writes to: text in the encoding of stdout, which decides how lines are drawn."""
+def _width(text: str) -> int:
+    """Return the columns of a terminal that a text takes: Chinese, Japanese and Korean characters take two."""
+    if text.isascii():
+        return len(text)
+    return sum(0 if combining(one) else 1 + (east_asian_width(one) in "WF") for one in text)
 
-    @property
-    def encoding(self) -> str:  # type: ignore[override]
-        return getattr(sys.stdout, "encoding", None) or "ascii"
+
+def _fold(text: str, width: int) -> list[str]:
+    """Break a text between words, and words that are wider, into lines of at most so many columns, one at least."""
+    lines = [""]
+    for part in re.findall(r"\S+|\s+", text):
+        if _width(lines[-1] + part) <= width:
+            lines[-1] += part
+        elif not part.isspace():
+            lines += [""] * bool(lines[-1])
+            for character in part:
+                if _width(lines[-1] + character) > width:
+                    lines.append("")
+                lines[-1] += character
+    return lines
 
 
 def render_listing(
@@ -195,8 +205,9 @@ def render_listing(
     """Lay out a listing, styled on a terminal; `certificate` is of the judged series, `refused` was said elsewhere."""
     terminal = is_terminal(sys.stdout)
     width = max(shutil.get_terminal_size().columns, _NARROWEST) if terminal else _UNLIMITED
+    is_styled = terminal and not os.environ.get("NO_COLOR") and sys.platform != "win32"  # old consoles show the codes
     entries = listing["series"]  # in the order of their numbers: by patient, study and number in the study
-    lines, left_out = _render_table(entries, listing["chosen"], width, terminal and not os.environ.get("NO_COLOR"))
+    lines, left_out = _render_table(entries, listing["chosen"], width, is_styled)
     if left_out:
         lines += _wrap(f"({', '.join(left_out)} left out: a wider window or --json shows them)", width, "")
     shown = [entry for entry in entries if entry["number"] != refused]
@@ -241,8 +252,9 @@ def _columns(entries: Sequence[dict[str, Any]], chosen: int | None) -> Iterator[
     yield _Column("extent mm", [_format_lengths(entry["extent_mm"], ".0f") for entry in entries], left_out=1)
     thickness = [entry["slice_thickness_mm"] for entry in entries]
     yield _Column("thick", ["-" if t is None else f"{t:.4g}" for t in thickness], left_out=2, right=True)
-    tilts = ["-" if entry["tilt_deg"] is None else _format_tilt(entry["tilt_deg"]) for entry in entries]
-    yield _Column("tilt", tilts, left_out=4, right=True)
+    tilts = [entry["tilt_deg"] for entry in entries]
+    shown = ["-" if tilt is None else f"{round(tilt, 2) or 0:+.2f}".replace("+0.00", "0") for tilt in tilts]
+    yield _Column("tilt", shown, left_out=4, right=True)
     yield _Column("description", [printable(entry["description"] or "") for entry in entries], folds=True)
 
 
@@ -250,10 +262,6 @@ def _kind(entry: dict[str, Any]) -> str:
     """Return the modality, and the kind of object if it is not a stack of slices."""
     modality = printable(entry["modality"])
     return modality if entry["kind"] in ("stack", "other") else f"{modality} {entry['kind']}"
-
-
-def _format_tilt(degrees: float) -> str:
-    return f"{degrees:+.2f}" if round(degrees, 2) else "0"
 
 
 def _format_lengths(lengths: Sequence[float] | None, form: str) -> str:
@@ -269,22 +277,29 @@ def _render_table(
     if columns is None:
         return _render_list(every, width), []
     left_out = [column.heading for column in every if column not in columns]
-    from rich.console import Console, detect_legacy_windows
+    widths = [column.width for column in columns]
+    for number, column in enumerate(columns):
+        if column.folds:
+            longest = max(map(_width, (column.heading, *column.cells)))
+            widths[number] = min(longest, width - sum(widths) - _BETWEEN * (len(widths) - 1) + widths[number])
+    rule = "\u2500" if (getattr(sys.stdout, "encoding", None) or "ascii").lower().startswith("utf") else "-"
+    heading = _join_cells(columns, widths, [column.heading for column in columns], bold=styled)
+    lines = [heading, rule * (sum(widths) + _BETWEEN * (len(widths) - 1))]
+    parted = _are_several(entries, "patient")
+    for row, entry in enumerate(entries):
+        if parted and row and entries[row - 1]["patient"] != entry["patient"]:
+            lines.append("")
+        is_chosen = styled and entry["number"] == chosen  # no colours: they are not readable on every ground
+        folded = [_fold(column.cells[row], space) for column, space in zip(columns, widths, strict=True)]
+        lines += [_join_cells(columns, widths, cells, bold=is_chosen) for cells in zip_longest(*folded, fillvalue="")]
+    return lines, left_out
 
-    styled = styled and not detect_legacy_windows()
-    console = Console(
-        file=_Sink(),
-        width=width,
-        color_system="standard" if styled else None,
-        force_terminal=styled,
-        legacy_windows=False,
-        highlight=False,
-        markup=False,
-        emoji=False,
-    )
-    with console.capture() as captured:
-        console.print(_make_table(columns, entries, chosen))
-    return [line.rstrip() for line in captured.get().splitlines()], left_out
+
+def _join_cells(columns: Sequence[_Column], widths: Sequence[int], cells: Sequence[str], *, bold: bool) -> str:
+    filled = [(" " * (width - _width(cell)), cell) for cell, width in zip(cells, widths, strict=True)]
+    padded = ("".join(pair if column.right else pair[::-1]) for column, pair in zip(columns, filled, strict=True))
+    line = (" " * _BETWEEN).join(padded).rstrip()
+    return f"\x1b[1m{line}\x1b[0m" if bold else line
 
 
 def _choose_columns(every: Sequence[_Column], width: int) -> list[_Column] | None:
@@ -298,33 +313,6 @@ def _choose_columns(every: Sequence[_Column], width: int) -> list[_Column] | Non
             shown.append(column)
             free -= column.width + _BETWEEN
     return [column for column in every if column in shown]
-
-
-def _make_table(columns: Sequence[_Column], entries: Sequence[dict[str, Any]], chosen: int | None) -> Table:
-    from rich import box
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(
-        box=box.SIMPLE_HEAD, show_edge=False, padding=(0, _BETWEEN - 1, 0, 0), pad_edge=False, header_style="bold"
-    )
-    for column in columns:
-        table.add_column(
-            Text(column.heading),
-            justify="right" if column.right else "left",
-            no_wrap=not column.folds,
-            overflow="fold",
-            min_width=column.width,
-        )
-    parted = _are_several(entries, "patient")
-    for row, entry in enumerate(entries):
-        following = entries[row + 1] if row + 1 < len(entries) else entry
-        table.add_row(
-            *(Text(column.cells[row]) for column in columns),
-            style="bold" if entry["number"] == chosen else "",  # no colours: they are not readable on every ground
-            end_section=parted and following["patient"] != entry["patient"],
-        )
-    return table
 
 
 def _render_list(columns: Sequence[_Column], width: int) -> list[str]:
@@ -346,12 +334,8 @@ def _collect_texts(entries: Sequence[dict[str, Any]], field: str) -> Iterator[tu
         for text in entry[field]:
             numbers.setdefault(str(text), []).append(entry["number"])
     for text, numbered in numbers.items():
-        runs: list[list[int]] = []
-        for number in sorted(numbered):
-            if runs and number == runs[-1][-1] + 1:
-                runs[-1].append(number)
-            else:
-                runs.append([number])
+        following = groupby(enumerate(sorted(numbered)), lambda counted: counted[1] - counted[0])
+        runs = [[number for _, number in run] for _, run in following]
         yield ", ".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else str(run[0]) for run in runs), text
 
 

@@ -358,6 +358,16 @@ def test_listing_of_several_patients_has_their_numbers_and_those_of_studies() ->
     assert lines[0].split()[:3] == ["series", "patient", "study"] and "phases" in lines[0]
     rows = [line.removeprefix("*").split()[:3] for line in lines if re.match(r"[* ] +\d", line)]
     assert rows == [["1", "1", "1"], ["2", "1", "3"], ["3", "28", "2"], ["4", "28", "2"], ["5", "-", "-"]]
+    assert [number for number, line in enumerate(lines) if not line] == [4, 7]  # a patient ends there
+
+
+def test_description_of_wide_characters_is_folded_to_their_width(terminal: Any) -> None:
+    terminal(100)
+    lines = render_listing(make_listing(make_entry(1, description="\u810a\u67f1" * 30), chosen=None), [])
+    folded = [line.rpartition(" ")[2] for line in lines if "\u810a" in line]
+    assert "".join(folded) == "\u810a\u67f1" * 30
+    columns = [len(line) + line.count("\u810a") + line.count("\u67f1") for line in lines if "\u810a" in line]
+    assert len(folded) > 1 and max(columns) in (99, 100)  # each takes two
 
 
 @pytest.mark.release

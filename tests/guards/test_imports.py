@@ -16,7 +16,7 @@ from variants import daily
 import clrecon
 
 HEAVY = {
-    "imagecodecs", "numpy", "pydicom", "pyopencl", "pyvista", "rich", "scipy", "skimage", "trimesh", "vtk",
+    "imagecodecs", "numpy", "pydicom", "pyopencl", "pyvista", "scipy", "skimage", "trimesh", "vtk",
     "vtkmodules",
 }  # fmt: skip
 LOADED = "import json, sys; print(json.dumps(sorted({name.partition('.')[0] for name in sys.modules})))"
@@ -52,16 +52,6 @@ def test_help_loads_no_heavy_package(tmp_path: Path) -> None:
 def test_help_of_clouds_with_the_kinds_of_points_loads_no_heavy_package(tmp_path: Path) -> None:
     code = HELP.replace('"--help"', '"cloud", "--help"').replace('"mesh"', '"surface|cortex|shell|voxels"')
     assert loaded_after(code, tmp_path) & HEAVY == set()
-
-
-def test_import_of_the_command_info_does_not_load_rich(tmp_path: Path) -> None:
-    assert "rich" not in loaded_after("from clrecon.cli import info", tmp_path)
-
-
-def test_listing_that_is_shown_loads_rich(tmp_path: Path) -> None:
-    listing: dict[str, object] = {"series": [], "chosen": None, "certificate": None}
-    show = f"from clrecon.cli import info; info.render_listing({listing}, [])"
-    assert "rich" in loaded_after(show, tmp_path)
 
 
 def test_use_of_a_volume_loads_numpy_and_no_other_heavy_package(tmp_path: Path) -> None:

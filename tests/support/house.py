@@ -83,7 +83,6 @@ INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
     "viewer": frozenset({"aiohttp", "PIL", "napari", "pyvista", "vtk", "vtkmodules"}),
     # vtkmodules: peers of the bench and of the comparison, whose page has plots and pictures.
     "proof": frozenset({"scipy", "pyvista", "vtkmodules", "matplotlib", "PIL"}),
-    "cli": frozenset({"rich"}),
     "spine": frozenset({"scipy"}),
 }
 
