@@ -64,12 +64,12 @@ from clrecon.operators.surface.smoothing import smooth_mesh as smooth_mesh
 from clrecon.operators.vertebrae.inside import VertebraInside as VertebraInside
 from clrecon.operators.vertebrae.inside import vertebra_inside as vertebra_inside
 from clrecon.operators.vertebrae.solid import vertebra_solid as vertebra_solid
-from clrecon.points import PointCloud as PointCloud
-from clrecon.points import PointStep as PointStep
-from clrecon.points import drop_ghost_slices as drop_ghost_slices
-from clrecon.points import fill_ghost_slices as fill_ghost_slices
-from clrecon.points import keep_clusters as keep_clusters
+from clrecon.points.cloud import PointCloud as PointCloud
+from clrecon.points.cloud import PointStep as PointStep
 from clrecon.points.cloud_reader import read_points as read_points
+from clrecon.points.ghost_slices import drop_ghost_slices as drop_ghost_slices
+from clrecon.points.ghost_slices import fill_ghost_slices as fill_ghost_slices
+from clrecon.points.keep import keep_clusters as keep_clusters
 from clrecon.proof.compare.mesh_cells import GridCells as GridCells
 from clrecon.proof.compare.mesh_cells import find_mesh_cells as find_mesh_cells
 from clrecon.proof.compare.mesh_cells import measure_cells as measure_cells

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from clrecon.geometry import Volume
     from clrecon.geometry.blocks import Box
     from clrecon.labels import LabelMap
-    from clrecon.points import PointCloud
+    from clrecon.points.cloud import PointCloud
 
 
 _OTHER_CLOUDS = (".pcd", ".e57", ".laz", ".pts", ".ptx")

@@ -19,7 +19,7 @@ from clrecon.errors import ClreconError
 from clrecon.exchange.content import certificate_lines
 from clrecon.exchange.formats import MOST_PARTS
 from clrecon.geometry import Volume
-from clrecon.points import PointCloud
+from clrecon.points.cloud import PointCloud
 from clrecon.reading.common.source_facts import SeriesListing
 from clrecon.system.arguments import ViewName
 from clrecon.system.base_classes import Closing
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from clrecon.jobs.view import ViewSettings
     from clrecon.labels import LabelMap
     from clrecon.mesh import Mesh
-    from clrecon.points import PointCloud
+    from clrecon.points.cloud import PointCloud
     from clrecon.reading.common.source_facts import SeriesListing
     from clrecon.rendering import Rendering
     from clrecon.viewer.model.objects import ShownObject

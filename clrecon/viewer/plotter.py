@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
     from clrecon.labels import LabelMap
     from clrecon.mesh import Mesh
-    from clrecon.points import PointCloud
+    from clrecon.points.cloud import PointCloud
     from clrecon.viewer.notebook import LivePage
 
 SIZE = (1100, 850)

@@ -99,7 +99,7 @@ def measure_normals(job: Job) -> dict[str, Any]:
     import small_gicp
 
     from clrecon.operators.points.normals import estimate_normals
-    from clrecon.points import PointCloud
+    from clrecon.points.cloud import PointCloud
 
     def with_open3d(points: Any) -> Any:
         cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points.astype(np.float64)))
@@ -123,7 +123,7 @@ def measure_filter(job: Job) -> dict[str, Any]:
     from scipy.spatial import cKDTree
 
     from clrecon.operators.points.denoising import denoise_points
-    from clrecon.points import PointCloud
+    from clrecon.points.cloud import PointCloud
     from clrecon.proof.points.neighbours import denoise_points as filter_twin
     from clrecon.proof.points.neighbours import principal_axes
 
@@ -154,7 +154,7 @@ def measure_filter(job: Job) -> dict[str, Any]:
 def _kernel_seconds(points: Any, job: Job) -> float:
     """Return the device's seconds of the kernel filter_points alone."""
     from clrecon.operators.points.denoising import denoise_points
-    from clrecon.points import PointCloud
+    from clrecon.points.cloud import PointCloud
 
     seconds: float = denoise_points(PointCloud(points), K, device=job.device).facts["kernel_seconds"]["filter_points"]
     return seconds
@@ -185,7 +185,7 @@ def measure_outliers(job: Job) -> dict[str, Any]:
     import open3d
 
     from clrecon.operators.points.denoising import remove_outliers
-    from clrecon.points import PointCloud
+    from clrecon.points.cloud import PointCloud
 
     def with_open3d(points: Any) -> Any:
         cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points.astype(np.float64)))

@@ -15,7 +15,7 @@ from refusals import refused
 
 from clrecon.errors import NoSurfaceError, OutputError, RefusedInputError, UsageError
 from clrecon.exchange.formats import CLOUD_FORMATS, describe_cloud_losses, write_cloud
-from clrecon.points import PointCloud
+from clrecon.points.cloud import PointCloud
 from clrecon.points.cloud_reader import read_points
 
 pytestmark = pytest.mark.unit

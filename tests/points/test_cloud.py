@@ -10,8 +10,7 @@ import pytest
 from refusals import refused
 
 from clrecon.errors import UsageError
-from clrecon.points import PointCloud, PointStep
-from clrecon.points.cloud import VoxelNumbers
+from clrecon.points.cloud import PointCloud, PointStep, VoxelNumbers
 
 
 def numbered_cloud(n: int = 5) -> PointCloud:

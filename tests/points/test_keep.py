@@ -10,7 +10,7 @@ import tolerances
 from refusals import refused
 
 from clrecon.errors import NoSurfaceError, UsageError
-from clrecon.points import PointCloud
+from clrecon.points.cloud import PointCloud
 from clrecon.points.keep import keep_clusters, measure_clusters, parse_keep_rules
 
 

@@ -14,7 +14,7 @@ from refusals import assert_one_line, refused
 from sample_meshes import LongTable
 
 from clrecon.errors import ClreconError, RefusedInputError, UsageError
-from clrecon.points import PointCloud
+from clrecon.points.cloud import PointCloud
 from clrecon.points.cloud_reader import _check_points, read_points
 
 pytestmark = pytest.mark.unit

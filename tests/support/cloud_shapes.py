@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from clrecon.opencl import download
-from clrecon.points import PointCloud
+from clrecon.points.cloud import PointCloud
 from clrecon.proof.points import field as twin
 
 

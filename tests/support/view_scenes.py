@@ -10,7 +10,7 @@ import sample_meshes as samples
 from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
 from clrecon.mesh import Mesh
-from clrecon.points import PointCloud
+from clrecon.points.cloud import PointCloud
 
 AFFINE = np.array([[0.9, 0.08, 0.0, -60.0], [-0.08, 0.9, 0.1, -40.0], [0.0, -0.1, 1.4, 200.0], [0, 0, 0, 1.0]])
 SHAPE = (22, 40, 44)

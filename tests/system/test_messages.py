@@ -25,7 +25,7 @@ from clrecon.labels.statistics import measure_labels
 from clrecon.mesh import Mesh
 from clrecon.operators.points.clusters import Clustering
 from clrecon.operators.points.neighbours import Neighbours
-from clrecon.points import PointCloud, PointStep
+from clrecon.points.cloud import PointCloud, PointStep
 from clrecon.proof.compare.mesh_cells import GridCells
 from clrecon.proof.compare.methods import CompareSettings
 from clrecon.proof.phantom import PhantomSettings, phantom_truth

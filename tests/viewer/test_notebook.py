@@ -16,7 +16,7 @@ from clrecon.exchange.page import parse_page
 from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
 from clrecon.mesh import Mesh
-from clrecon.points import PointCloud
+from clrecon.points.cloud import PointCloud
 from clrecon.reading.common.source_facts import SeriesEntry, SeriesListing
 from clrecon.viewer.notebook import _MOST_ROWS, _table
 

@@ -15,7 +15,8 @@ from clrecon.jobs.cloud.steps import CloudSteps, find_ghosts, iso_value_of, take
 from clrecon.jobs.inputs import describe_cloud, is_cloud_file, refuse_other_clouds, refuse_scan_settings
 from clrecon.jobs.preprocess import Band, mask_volume, preprocess_volume, restrict_volume
 from clrecon.jobs.run import Run, RunReport
-from clrecon.points import SURFACE_KINDS, PointCloud
+from clrecon.points import SURFACE_KINDS
+from clrecon.points.cloud import PointCloud
 from clrecon.points.ghost_slices import GhostSlices, fill_ghost_slices
 from clrecon.system.arguments import name_parameter
 from clrecon.system.files import Staged, allow_open_files

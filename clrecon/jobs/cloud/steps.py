@@ -14,8 +14,7 @@ from clrecon.geometry import Volume
 from clrecon.jobs.cloud.settings import CloudSettings, Clustering
 from clrecon.jobs.presets import DEFAULT_PRESET, find_iso_preset
 from clrecon.jobs.run import trial_cube
-from clrecon.points import PointCloud, PointStep
-from clrecon.points.cloud import count_numbers
+from clrecon.points.cloud import PointCloud, PointStep, count_numbers
 from clrecon.points.ghost_slices import GhostSlices, drop_ghost_slices
 from clrecon.points.stencil import Lattice
 from clrecon.system.arguments import name_parameter

@@ -26,7 +26,7 @@ from clrecon.jobs.run import Run, RunReport
 from clrecon.labels import LabelMap, file_suffixes
 from clrecon.mesh import Mesh
 from clrecon.mesh.mesh_reader import read_mesh
-from clrecon.points import PointCloud
+from clrecon.points.cloud import PointCloud
 from clrecon.rendering.movies import animation_kind, check_animation, stage_animation, turntable_cameras
 from clrecon.rendering.pictures.annotations import check_caption, edge_letters
 from clrecon.rendering.pictures.label_style import NO_LABEL, find_shown

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from clrecon.labels import LabelMap
     from clrecon.mesh import Mesh
     from clrecon.opencl import Device
-    from clrecon.points import PointCloud
+    from clrecon.points.cloud import PointCloud
     from clrecon.rendering import Lighting, Rendering, TransferFunction
     from clrecon.rendering.views.camera import Camera
 

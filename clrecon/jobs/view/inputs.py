@@ -26,7 +26,7 @@ from clrecon.system.text import escape_text
 
 if TYPE_CHECKING:
     from clrecon.labels import LabelMap
-    from clrecon.points import PointCloud
+    from clrecon.points.cloud import PointCloud
 
 
 _OF_A_VIEW = {"iso_value", "preset", "half_way", "space", "labels", "one_file"}

@@ -17,8 +17,7 @@ from clrecon.operators.points.free_clusters import cluster_free_points
 from clrecon.operators.points.point_extraction import extract_points
 from clrecon.operators.points.voxel_clusters import ClusterSearch, checked_min_samples, pad_for, search_bytes
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
-from clrecon.points import PointCloud, PointStep
-from clrecon.points.cloud import VoxelNumbers
+from clrecon.points.cloud import PointCloud, PointStep, VoxelNumbers
 from clrecon.points.keep import REPORTED, ClusterFigures, measure_clusters
 from clrecon.points.stencil import Lattice, Stencil, checked_eps, make_stencil
 from clrecon.system.arguments import explains_arguments, name_parameter

@@ -14,7 +14,7 @@ from clrecon.opencl import Device, Program, Stopwatch
 from clrecon.operators.points.grid import fill_grid, plan_grid
 from clrecon.operators.points.neighbours import NeighbourSearch, Part, check_neighbours, take_points
 from clrecon.operators.points.normals import FEWEST_NEIGHBOURS, PlaneFits
-from clrecon.points import PointCloud, PointStep
+from clrecon.points.cloud import PointCloud, PointStep
 from clrecon.points.spacing import VARIATION_OF_FEATURES, distance_ratios, find_features, ratio_threshold
 from clrecon.system.arguments import Features, explains_arguments
 from clrecon.system.light_dataclass import dataclass

@@ -21,7 +21,7 @@ from clrecon.operators.points.grid import (
     plan_grid,
     prepare_grid,
 )
-from clrecon.points import PointCloud
+from clrecon.points.cloud import PointCloud
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.pieces import list_distinct

@@ -12,7 +12,7 @@ from clrecon.opencl import Device, Stopwatch
 from clrecon.operators.points.neighbours import NeighbourSearch, Part, check_neighbours, take_points
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.operators.resident.tables import voxel_variants
-from clrecon.points import PointCloud, PointStep
+from clrecon.points.cloud import PointCloud, PointStep
 from clrecon.system.arguments import as_numbers, explains_arguments, name_parameter
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, ignore_progress

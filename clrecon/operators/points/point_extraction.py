@@ -23,8 +23,8 @@ from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.operators.resident.tables import label_variants, voxel_variants
 from clrecon.operators.surface.marching_cubes import pad4, split_steps
 from clrecon.operators.surface.slabs import OUTPUT_SHARE
-from clrecon.points import POINT_KINDS, SURFACE_KINDS, PointCloud
-from clrecon.points.cloud import MOST_POINTS, VoxelNumbers
+from clrecon.points import POINT_KINDS, SURFACE_KINDS
+from clrecon.points.cloud import MOST_POINTS, PointCloud, VoxelNumbers
 from clrecon.system.arguments import PointKind, explains_arguments, name_parameter
 from clrecon.system.light_dataclass import dataclass, field
 from clrecon.system.progress import Progress, ignore_progress

@@ -14,7 +14,7 @@ from clrecon.mesh import Mesh
 from clrecon.opencl import Device, Stopwatch, check_memory, take_device, with_fallback
 from clrecon.operators.points.field import FieldSettings, NodeField, Signs, decide_signs
 from clrecon.operators.surface.extract import extract_isosurface
-from clrecon.points import PointCloud
+from clrecon.points.cloud import PointCloud
 from clrecon.points.spacing import mean_spacing
 from clrecon.system.arguments import explains_arguments, name_parameter
 from clrecon.system.light_dataclass import dataclass, field

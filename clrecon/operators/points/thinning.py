@@ -16,7 +16,7 @@ from clrecon.opencl import Device, Program, Stopwatch
 from clrecon.operators.points.grid import GridPlan, PointGrid, fill_grid, plan_grid
 from clrecon.operators.points.neighbours import find_neighbours
 from clrecon.operators.primitives.union_find import hook_in_rounds
-from clrecon.points import PointCloud, PointStep
+from clrecon.points.cloud import PointCloud, PointStep
 from clrecon.system.arguments import explains_arguments, name_parameter
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, ignore_progress

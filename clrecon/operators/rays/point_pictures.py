@@ -16,7 +16,7 @@ from clrecon.geometry.grid import Grid
 from clrecon.opencl import Device, Stopwatch
 from clrecon.operators.rays.picture_buffers import Shot, background_color, describe_picture, highlight_table, light_row
 from clrecon.operators.resident.device_volume import DeviceWorker
-from clrecon.points import PointCloud
+from clrecon.points.cloud import PointCloud
 from clrecon.points.spacing import mean_spacing
 from clrecon.rendering import Lighting, Rendering
 from clrecon.rendering.looks.colors import find_color

@@ -12,7 +12,7 @@ from clrecon.opencl import Device
 from clrecon.operators.rays.point_pictures import PointPictures
 from clrecon.operators.rays.scene import ScenePictures, Subject, check_objects
 from clrecon.operators.rays.volume_renderer import Place, VolumeRenderer
-from clrecon.points import PointCloud
+from clrecon.points.cloud import PointCloud
 from clrecon.rendering import Rendering
 from clrecon.rendering.looks.colors import is_transparent
 from clrecon.rendering.pictures.modes import Look, find_style

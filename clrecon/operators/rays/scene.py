@@ -26,7 +26,7 @@ from clrecon.operators.rays.picture_buffers import Between, DrawnVolume, LateDep
 from clrecon.operators.rays.point_pictures import PointPictures, cloud_box, eye_table
 from clrecon.operators.rays.volume_renderer import VolumeRenderer, shown_box
 from clrecon.operators.resident.device_volume import DeviceVolume, DeviceWorker
-from clrecon.points import PointCloud
+from clrecon.points.cloud import PointCloud
 from clrecon.rendering import Lighting, Rendering
 from clrecon.rendering.pictures.object_looks import MeshLook, PointLook
 from clrecon.rendering.pictures.styles import SlicesInSpace, Style, SurfaceLook, VolumeLook

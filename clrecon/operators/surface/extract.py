@@ -24,7 +24,7 @@ from clrecon.operators.surface.extraction import Extraction, choose_grid
 from clrecon.operators.surface.seeds import Seeds
 from clrecon.operators.surface.slabs import SampleGrid, Slab, plan_slabs
 from clrecon.operators.surface.spans import PassingSurface
-from clrecon.points import PointCloud
+from clrecon.points.cloud import PointCloud
 from clrecon.system.arguments import Space, Topology, VertexRule, explains_arguments, name_parameter
 from clrecon.system.files import check_writable
 from clrecon.system.paths import keep_existing

@@ -17,7 +17,7 @@ from clrecon.mesh import Mesh
 from clrecon.mesh.triangles import vertex_normals
 from clrecon.opencl import Device
 from clrecon.operators.resident.device_volume import DeviceVolume
-from clrecon.points import PointCloud
+from clrecon.points.cloud import PointCloud
 from clrecon.proof.compare.processes import Request
 from clrecon.proof.rays.render import cast_rays
 from clrecon.proof.timing import usable_cores

@@ -20,7 +20,7 @@ from clrecon.operators.points.neighbours import find_neighbours
 from clrecon.operators.points.normals import estimate_normals, find_gradients
 from clrecon.operators.points.thinning import choose_points, grow_cells
 from clrecon.operators.resident.device_volume import DeviceVolume
-from clrecon.points import PointCloud
+from clrecon.points.cloud import PointCloud
 from clrecon.points.spacing import VARIATION_OF_FEATURES, distance_ratios, find_features, ratio_threshold
 from clrecon.proof.checking import (
     OBLIQUE,

@@ -17,7 +17,7 @@ from clrecon.opencl import Device
 from clrecon.operators.rays.mesh_pictures import box_around
 from clrecon.operators.rays.scene import ScenePictures
 from clrecon.operators.resident.device_volume import DeviceVolume
-from clrecon.points import PointCloud
+from clrecon.points.cloud import PointCloud
 from clrecon.rendering import Rendering
 from clrecon.rendering.pictures.object_looks import MeshLook
 from clrecon.rendering.pictures.styles import CurveCut, Projection, SlicesInSpace, Style, VolumeLook

@@ -15,7 +15,7 @@ from clrecon.exchange.formats import ASSEMBLIES, CLOUD_FORMATS, FORMATS, stage_a
 from clrecon.geometry import Volume
 from clrecon.mesh import Mesh
 from clrecon.operators.masks.mask import Mask
-from clrecon.points import PointCloud
+from clrecon.points.cloud import PointCloud
 from clrecon.reading.grids.write_volume import FORMATS as VOLUME_FORMATS
 from clrecon.rendering.pictures.object_looks import MESH_COLORS
 from clrecon.rendering.pictures.picture import IMAGE_FORMATS

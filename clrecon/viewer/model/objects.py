@@ -16,7 +16,7 @@ from clrecon.geometry.affine import Float64Array
 from clrecon.labels import LabelMap
 from clrecon.mesh import Mesh
 from clrecon.mesh.triangles import vertex_normals
-from clrecon.points import PointCloud
+from clrecon.points.cloud import PointCloud
 from clrecon.rendering.looks.presets import PRESETS
 from clrecon.rendering.pictures.label_style import distinct_colors
 from clrecon.rendering.views.camera import box_corners

@@ -18,7 +18,7 @@ from clrecon.errors import NoDicomError, RefusedInputError, UsageError
 from clrecon.jobs.inputs import CLOUD_INPUTS, is_cloud_file
 from clrecon.jobs.render.job import PictureFiles, make_pictures
 from clrecon.jobs.render.settings import RenderSettings
-from clrecon.points import PointCloud
+from clrecon.points.cloud import PointCloud
 
 pytestmark = pytest.mark.first_device
 

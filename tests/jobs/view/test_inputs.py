@@ -16,7 +16,7 @@ from clrecon.jobs.view import ViewSettings
 from clrecon.jobs.view.inputs import open_inputs
 from clrecon.labels import LabelMap
 from clrecon.mesh import Mesh
-from clrecon.points import PointCloud
+from clrecon.points.cloud import PointCloud
 from clrecon.viewer.model.objects import ShownLabels, wrap_inputs
 
 pytestmark = pytest.mark.unit

@@ -10,7 +10,7 @@ from variants import daily_rows
 
 from clrecon.errors import UsageError
 from clrecon.operators.points.denoising import denoise_points
-from clrecon.points import PointCloud
+from clrecon.points.cloud import PointCloud
 from clrecon.points.spacing import VARIATION_OF_FEATURES, distance_ratios, find_features, ratio_threshold
 from clrecon.proof.points import clusters as grid_twin
 from clrecon.proof.points import neighbours as twin

@@ -13,7 +13,7 @@ from clrecon.opencl import memory_limits, upload
 from clrecon.opencl.buffers import raw
 from clrecon.operators.points.field import MOST_NODES, FieldSettings, Masks, NodeField, decide_signs, plan_nodes
 from clrecon.operators.points.grid import plan_grid
-from clrecon.points import PointCloud
+from clrecon.points.cloud import PointCloud
 from clrecon.proof.points import field as twin
 
 

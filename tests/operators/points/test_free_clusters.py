@@ -16,7 +16,7 @@ from clrecon.operators.points import free_clusters as module
 from clrecon.operators.points.clusters import cluster_points
 from clrecon.operators.points.free_clusters import ClusterSearch, cluster_free_points, find_clusters, plan_cells
 from clrecon.operators.points.grid import MOST_CELLS_ALONG, fill_grid
-from clrecon.points import PointCloud
+from clrecon.points.cloud import PointCloud
 from clrecon.proof.points import clusters as grid_twin
 from clrecon.proof.points import clusters as twin
 

@@ -18,8 +18,9 @@ from clrecon.geometry import Volume
 from clrecon.operators.masks.voxel_mask import mark_band
 from clrecon.operators.points.slice_overlap import count_overlaps, find_ghost_slices
 from clrecon.operators.resident.device_volume import DeviceVolume
-from clrecon.points import PointCloud, drop_ghost_slices, fill_ghost_slices, keep_clusters
-from clrecon.points.ghost_slices import judge_slices
+from clrecon.points.cloud import PointCloud
+from clrecon.points.ghost_slices import drop_ghost_slices, fill_ghost_slices, judge_slices
+from clrecon.points.keep import keep_clusters
 from clrecon.proof.phantom import PhantomSettings, make_phantom, write_phantom
 from clrecon.proof.points import clusters as twin
 

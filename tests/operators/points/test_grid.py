@@ -18,7 +18,7 @@ from clrecon.operators.points.grid import (
     make_grid,
     plan_grid,
 )
-from clrecon.points import PointCloud
+from clrecon.points.cloud import PointCloud
 from clrecon.proof.points import clusters as twin
 
 

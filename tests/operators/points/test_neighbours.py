@@ -14,7 +14,7 @@ from clrecon.opencl import download
 from clrecon.operators.points import neighbours
 from clrecon.operators.points.grid import fill_grid, plan_grid
 from clrecon.operators.points.neighbours import check_pairs, choose_cell_edge, find_neighbours
-from clrecon.points import PointCloud
+from clrecon.points.cloud import PointCloud
 from clrecon.proof.points import neighbours as twin
 
 RNG = np.random.default_rng(7)

@@ -17,7 +17,7 @@ from clrecon.opencl import Stopwatch
 from clrecon.operators.points import normals
 from clrecon.operators.points.normals import estimate_normals
 from clrecon.operators.resident.device_volume import DeviceVolume
-from clrecon.points import PointCloud
+from clrecon.points.cloud import PointCloud
 from clrecon.proof.points.clusters import find_gradients as gradients_twin
 from clrecon.proof.points.neighbours import find_neighbours, orient_by_gradients, orient_from, principal_axes
 

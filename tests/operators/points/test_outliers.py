@@ -10,7 +10,7 @@ from tolerances import MEAN_DISTANCE_SHARE
 
 from clrecon.errors import UsageError
 from clrecon.operators.points.denoising import remove_outliers
-from clrecon.points import PointCloud
+from clrecon.points.cloud import PointCloud
 from clrecon.proof.points.neighbours import find_neighbours, find_outliers, mean_distances
 
 

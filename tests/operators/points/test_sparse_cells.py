@@ -11,7 +11,7 @@ from clrecon.errors import DeviceMemoryError, UsageError
 from clrecon.operators.points.grid import make_grid, plan_grid
 from clrecon.operators.points.neighbours import find_neighbours
 from clrecon.operators.points.thinning import REASONS, choose_edge, grow_cells, remove_sparse_cells
-from clrecon.points import PointCloud
+from clrecon.points.cloud import PointCloud
 from clrecon.points.spacing import count_cells, find_cell_numbers
 from clrecon.proof.points import clusters as twin
 

@@ -10,7 +10,7 @@ from refusals import refused
 from clrecon.errors import DeviceMemoryError, UsageError
 from clrecon.operators.points.grid import MOST_CELLS, MOST_CELLS_ALONG, plan_grid
 from clrecon.operators.points.thinning import choose_points, thin_points
-from clrecon.points import PointCloud
+from clrecon.points.cloud import PointCloud
 from clrecon.proof.points import clusters as twin
 
 

@@ -21,7 +21,7 @@ from clrecon.operators.points import voxel_clusters
 from clrecon.operators.points.clusters import cluster_points
 from clrecon.operators.points.voxel_clusters import ClusterSearch, pad_for
 from clrecon.operators.resident.device_volume import DeviceVolume
-from clrecon.points import PointCloud
+from clrecon.points.cloud import PointCloud
 from clrecon.points.stencil import Lattice, make_stencil
 from clrecon.proof.points import clusters as twin
 

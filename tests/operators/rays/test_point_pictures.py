@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from clrecon.operators.rays.point_pictures import LARGEST_DISC, PointPictures
-from clrecon.points import PointCloud
+from clrecon.points.cloud import PointCloud
 from clrecon.points.spacing import mean_spacing
 from clrecon.rendering.pictures.object_looks import PointLook
 from clrecon.rendering.views.camera import Camera

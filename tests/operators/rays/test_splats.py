@@ -22,7 +22,7 @@ from clrecon.operators.rays.point_pictures import (
     cloud_box,
     draw_splats,
 )
-from clrecon.points import PointCloud
+from clrecon.points.cloud import PointCloud
 from clrecon.proof.rays.objects import find_splats, shade_splats
 from clrecon.rendering import UNSHADED, Lighting
 from clrecon.rendering.pictures.object_looks import PointLook

@@ -15,7 +15,7 @@ from view_models import make_model
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.labels.resample import ResampledLabels
-from clrecon.points import PointCloud
+from clrecon.points.cloud import PointCloud
 from clrecon.viewer.drawing.painter import Painter
 from clrecon.viewer.drawing.saving import shown_cloud
 from clrecon.viewer.model import parts
