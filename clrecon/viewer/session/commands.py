@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from clrecon.errors import UsageError
@@ -75,92 +76,90 @@ class Command:
 COMMANDS: dict[str, Command] = {}
 
 
-def _model(command: str, words: str, method: str, /, *, takes: Mapping[str, Any] | None = None, **needs: Any) -> None:
-    """Add a command that is a method of the model, with arguments of the same names."""
-
-    COMMANDS[command] = Command(words, needs, takes or {}, f"model.{method}")
+def _command(owner: str, name: str, words: str, /, *, takes: Mapping[str, Any] | None = None, **needs: Any) -> None:
+    COMMANDS[name] = Command(words, needs, takes or {}, owner + name)
 
 
-def _session(command: str, words: str, method: str, /, *, takes: Mapping[str, Any] | None = None, **needs: Any) -> None:
-    COMMANDS[command] = Command(words, needs, takes or {}, method)
+_model = partial(_command, "model.")
+"""Adds a command that is a method of the model, with arguments of the same names."""
+_session = partial(_command, "")
 
 
-_model("turn", "turn about the middle, in shares of the height", "turn", dx=_check_number, dy=_check_number)
-_model("pan", "shift what is seen, in shares of the height", "pan", dx=_check_number, dy=_check_number)
-_model("zoom", "show larger; at: from the middle, in shares of the height", "zoom",
+_model("turn", "turn about the middle, in shares of the height", dx=_check_number, dy=_check_number)
+_model("pan", "shift what is seen, in shares of the height", dx=_check_number, dy=_check_number)
+_model("zoom", "show larger; at: from the middle, in shares of the height",
        factor=_check_number, takes={"at": _check_numbers(2)})  # fmt: skip
-_model("roll", "turn the picture clockwise, degrees", "roll", degrees=_check_number)
-_model("look", "look from a side of the patient, or azimuth and elevation", "look", view=_name_or_numbers(2))
-_model("set_perspective", "a perspective or a parallel camera", "set_perspective", on=_flag)
-_model("toggle_perspective", "a perspective camera for a parallel one, or back", "toggle_perspective")
-_model("set_iso", "iso value of the surfaces, HU", "set_iso", hu=_check_number)
-_model("step_iso", "move the iso value by HU, as far as the slider goes", "step_iso", by=_check_number)
-_model("set_mode", "what scans are shown as", "set_mode", name=_text)
-_model("step_mode", "go so many modes further down the list", "step_mode", steps=_whole)
-_model("set_window", "HU of black and white; of: slices or picture", "set_window",
+_model("roll", "turn the picture clockwise, degrees", degrees=_check_number)
+_model("look", "look from a side of the patient, or azimuth and elevation", view=_name_or_numbers(2))
+_model("set_perspective", "a perspective or a parallel camera", on=_flag)
+_model("toggle_perspective", "a perspective camera for a parallel one, or back")
+_model("set_iso", "iso value of the surfaces, HU", hu=_check_number)
+_model("step_iso", "move the iso value by HU, as far as the slider goes", by=_check_number)
+_model("set_mode", "what scans are shown as", name=_text)
+_model("step_mode", "go so many modes further down the list", steps=_whole)
+_model("set_window", "HU of black and white; of: slices or picture",
        low=_check_number, high=_check_number, takes={"of": _text})  # fmt: skip
-_model("set_occlusion", "darken hollows of scans, or not", "set_occlusion", on=_flag)
-_model("toggle_occlusion", "darken hollows of scans, or not any more", "toggle_occlusion")
-_session("set_table", "show or take away table and blankets", "set_table", shown=_flag)
-_session("toggle_table", "take table and blankets away, or show them", "toggle_table")
-_session("set_smooth", "smooth scans against their noise, or show them as read", "set_smooth", on=_flag)
-_session("toggle_smooth", "smooth scans against their noise, or show them as read", "toggle_smooth")
-_session("set_fitted", "show surfaces fitted to the bone, or at the iso value", "set_fitted", shown=_flag)
-_session("toggle_fitted", "fit surfaces to the bone, or stop that, or show them at the iso value", "toggle_fitted")
-_model("set_color_by", "colour fitted surfaces by thickness or error; null: not", "set_color_by", name=_or_none(_text))
-_model("step_color_by", "colour fitted surfaces by the next number, or not", "step_color_by")
-_model("scroll", "move a slice by steps of its voxels", "scroll", plane=_text, steps=_check_number)
-_session("zoom_slice", "show a slice of a size larger; about: from the middle, in shares of the height", "zoom_slice",
+_model("set_occlusion", "darken hollows of scans, or not", on=_flag)
+_model("toggle_occlusion", "darken hollows of scans, or not any more")
+_session("set_table", "show or take away table and blankets", shown=_flag)
+_session("toggle_table", "take table and blankets away, or show them")
+_session("set_smooth", "smooth scans against their noise, or show them as read", on=_flag)
+_session("toggle_smooth", "smooth scans against their noise, or show them as read")
+_session("set_fitted", "show surfaces fitted to the bone, or at the iso value", shown=_flag)
+_session("toggle_fitted", "fit surfaces to the bone, or stop that, or show them at the iso value")
+_model("set_color_by", "colour fitted surfaces by thickness or error; null: not", name=_or_none(_text))
+_model("step_color_by", "colour fitted surfaces by the next number, or not")
+_model("scroll", "move a slice by steps of its voxels", plane=_text, steps=_check_number)
+_session("zoom_slice", "show a slice of a size larger; about: from the middle, in shares of the height",
          plane=_text, factor=_check_number, size=_size, takes={"about": _check_numbers(2)})  # fmt: skip
-_session("pan_slice", "shift a slice of a size, in shares of the height", "pan_slice",
+_session("pan_slice", "shift a slice of a size, in shares of the height",
          plane=_text, dx=_check_number, dy=_check_number, size=_size)  # fmt: skip
-_model("turn_cross", "turn the cross on a slice clockwise, degrees", "turn_cross", plane=_text, degrees=_check_number)
-_model("straighten", "slices along the axes of the patient again", "straighten")
-_model("set_slab", "slices of so many mm: mean, max or min of them", "set_slab",
-       thickness=_check_number, takes={"combine": _text})  # fmt: skip
-_model("step_slab", "thick slices: mean, max, or planes again", "step_slab")
-_model("set_layout", "lay the views out: 1, 1+3 or 4", "set_layout", name=_text)
-_model("step_layout", "lay the views out in the next way", "step_layout")
-_model("set_compare", "first input left of a line at a share of the width, others right; null: together", "set_compare",
+_model("turn_cross", "turn the cross on a slice clockwise, degrees", plane=_text, degrees=_check_number)
+_model("straighten", "slices along the axes of the patient again")
+_model("set_slab", "slices of so many mm: mean, max or min of them", thickness=_check_number, takes={"combine": _text})
+_model("step_slab", "thick slices: mean, max, or planes again")
+_model("set_layout", "lay the views out: 1, 1+3 or 4", name=_text)
+_model("step_layout", "lay the views out in the next way")
+_model("set_compare", "first input left of a line at a share of the width, others right; null: together",
        share=_or_none(_check_number))  # fmt: skip
-_model("toggle_compare", "compare the first input with the others, or show all together", "toggle_compare")
-_session("find_spine", "find the canal of the spine, and make it a curve", "find_spine")
-_model("fit_slices", "show the slices as they fit", "fit_slices")
-_session("probe", "HU at a place, LPS mm", "probe", point=_check_numbers(3))
-_model("set_cross", "move the slices to a place, LPS mm", "set_cross", point=_check_numbers(3))
-_session("find_parts", "find the parts of the scans at the iso value", "find_parts")
-_model("show", "show or hide a part", "show", key=_text, visible=_flag)
-_model("only", "show one part alone", "only", key=_text)
-_model("show_all", "show all parts", "show_all")
-_model("set_color", "colour of a part, 0 to 1; null: its own", "set_color", key=_text, rgb=_or_none(_check_numbers(3)))
-_model("color_parts", "a colour for each part of scans", "color_parts", takes={"distinct": _flag})
-_model("toggle_colors", "a colour for each part of scans, or none", "toggle_colors")
-_model("toggle_small_parts", "hide the small components of scans, or show them", "toggle_small_parts")
-_model("set_opacity", "opacity of a part, 0 to 1", "set_opacity", key=_text, value=_check_number)
+_model("toggle_compare", "compare the first input with the others, or show all together")
+_session("find_spine", "find the canal of the spine, and make it a curve")
+_model("fit_slices", "show the slices as they fit")
+_session("probe", "HU at a place, LPS mm", point=_check_numbers(3))
+_model("set_cross", "move the slices to a place, LPS mm", point=_check_numbers(3))
+_session("find_parts", "find the parts of the scans at the iso value")
+_model("show", "show or hide a part", key=_text, visible=_flag)
+_model("only", "show one part alone", key=_text)
+_model("show_all", "show all parts")
+_model("set_color", "colour of a part, 0 to 1; null: its own", key=_text, rgb=_or_none(_check_numbers(3)))
+_model("color_parts", "a colour for each part of scans", takes={"distinct": _flag})
+_model("toggle_colors", "a colour for each part of scans, or none")
+_model("toggle_small_parts", "hide the small components of scans, or show them")
+_model("set_opacity", "opacity of a part, 0 to 1", key=_text, value=_check_number)
 _AT = {"x": _check_number, "y": _check_number, "size": _size}
-_session("pick", "what is seen at a pixel; plane: of a slice", "pick", takes={"plane": _or_none(_text)}, **_AT)
-_session("hide_at", "hide the part at a pixel", "hide_at", takes={"plane": _or_none(_text)}, **_AT)
-_session("only_at", "show the part at a pixel alone", "only_at", takes={"plane": _or_none(_text)}, **_AT)
-_session("cross_at", "move the slices to what is seen at a pixel", "cross_at", takes={"plane": _or_none(_text)}, **_AT)
-_session("add_point", "add what is seen at a pixel to the tool", "add_point", takes={"plane": _or_none(_text)}, **_AT)
-_session("mark_at", "keep the place at a pixel as a seed", "mark_at", takes={"plane": _or_none(_text)}, **_AT)
-_model("start_tool", "take points for: distance, angle, curve, seed, circle, box", "start_tool", name=_text)
-_model("end_tool", "put the tool away; a curve is made", "end_tool")
-_model("rename_measure", "name a measure by its number, from 0", "rename_measure", n=_whole, name=_text)
-_model("remove_measure", "drop one measure", "remove_measure", n=_whole)
-_model("clear_measures", "drop all measures", "clear_measures")
-_model("add_clip", "cut with a plane towards a side", "add_clip", direction=_name_or_numbers(3))
-_model("move_clip", "move a plane, 0 to 1", "move_clip", n=_whole, share=_check_number)
-_model("flip_clip", "take the other side of a plane away", "flip_clip", n=_whole)
-_model("remove_clip", "drop a plane", "remove_clip", n=_whole)
-_model("set_clip_box", "show a box, LPS mm; null: all", "set_clip_box",
+_session("pick", "what is seen at a pixel; plane: of a slice", takes={"plane": _or_none(_text)}, **_AT)
+_session("hide_at", "hide the part at a pixel", takes={"plane": _or_none(_text)}, **_AT)
+_session("only_at", "show the part at a pixel alone", takes={"plane": _or_none(_text)}, **_AT)
+_session("cross_at", "move the slices to what is seen at a pixel", takes={"plane": _or_none(_text)}, **_AT)
+_session("add_point", "add what is seen at a pixel to the tool", takes={"plane": _or_none(_text)}, **_AT)
+_session("mark_at", "keep the place at a pixel as a seed", takes={"plane": _or_none(_text)}, **_AT)
+_model("start_tool", "take points for: distance, angle, curve, seed, circle, box", name=_text)
+_model("end_tool", "put the tool away; a curve is made")
+_model("rename_measure", "name a measure by its number, from 0", n=_whole, name=_text)
+_model("remove_measure", "drop one measure", n=_whole)
+_model("clear_measures", "drop all measures")
+_model("add_clip", "cut with a plane towards a side", direction=_name_or_numbers(3))
+_model("move_clip", "move a plane, 0 to 1", n=_whole, share=_check_number)
+_model("flip_clip", "take the other side of a plane away", n=_whole)
+_model("remove_clip", "drop a plane", n=_whole)
+_model("set_clip_box", "show a box, LPS mm; null: all",
        low=_or_none(_check_numbers(3)), high=_or_none(_check_numbers(3)))  # fmt: skip
-_model("toggle_clip_box", "show a box about the cross, or all", "toggle_clip_box")
-_session("undo", "take the last change back", "undo")
-_model("hold", "the pointer is pressed: until it is released one step of undo", "hold", on=_flag)
-_session("save", "write what is shown; the extension says as what", "save", path=_text, takes={"size": _size})
-_session("cancel", "stop the work in the background", "cancel")
-_session("dismiss", "drop the words of the last error", "dismiss")
+_model("toggle_clip_box", "show a box about the cross, or all")
+_session("undo", "take the last change back")
+_model("hold", "the pointer is pressed: until it is released one step of undo", on=_flag)
+_session("save", "write what is shown; the extension says as what", path=_text, takes={"size": _size})
+_session("cancel", "stop the work in the background")
+_session("dismiss", "drop the words of the last error")
 
 
 def check_command(command: Any) -> tuple[Command, dict[str, Any]]:

@@ -12,11 +12,11 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from itertools import chain
 from operator import attrgetter
 from time import monotonic
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-from clrecon.anatomy.spine_line import find_spine_line
+from clrecon.anatomy.spine_line import SpineLine, find_spine_line
 from clrecon.errors import ClreconError, UsageError
 from clrecon.opencl import Device
 from clrecon.rendering import Rendering
@@ -43,6 +43,8 @@ REST_SECONDS = 0.2
 """After the last change until pictures are drawn sharp."""
 
 log = get_logger(__name__)
+
+Found = TypeVar("Found")
 
 _MOVING_MS = 40.0
 """Time of a coarse picture that its size is steered to."""
@@ -304,14 +306,19 @@ class ViewSession(Closing):
             self._apply_table(shown)
             return
 
-        def remove(job: Job) -> None:
-            self.painter.remove_table(job.progress)
+        self._do_later("table", lambda job: self.painter.remove_table(job.progress), lambda _: self._apply_table(False))
+
+    def _do_later(self, kind: str, work: Callable[[Job], Found], take: Callable[[Found], None]) -> None:
+        """Work in the background, and then, unless it was cancelled, take the result with the lock held."""
+
+        def work_and_take(job: Job) -> None:
+            outcome = work(job)
             with self._lock:
                 if not job.cancelled():
-                    self._apply_table(False)
+                    take(outcome)
             self._changed()
 
-        self._work.ask("table", remove, rank=3)
+        self._work.ask(kind, work_and_take, rank=3)
 
     def begin_with_bone(self, *, bare: bool) -> None:
         """Begin with the bone by volume rendering; `bare`: the painter took the table away, and its share is said."""
@@ -327,16 +334,12 @@ class ViewSession(Closing):
             self._said = None
             return
 
-        def smooth(job: Job) -> None:
-            mm = self.painter.smooth_scans(self.model.state)
-            with self._lock:
-                if not job.cancelled():
-                    self.model.set_smooth(mm)
-                    self._said = f"smoothed by a Gaussian of {mm:g} mm (y: as read)"
-                    self.rest()
-            self._changed()
+        def show_smooth(mm: float) -> None:
+            self.model.set_smooth(mm)
+            self._said = f"smoothed by a Gaussian of {mm:g} mm (y: as read)"
+            self.rest()
 
-        self._work.ask("smooth", smooth, rank=3)
+        self._do_later("smooth", lambda job: self.painter.smooth_scans(self.model.state), show_smooth)
 
     def toggle_smooth(self) -> None:
         self.set_smooth(not (self.model.state.smooth_mm or "smooth" in self._work.busy))
@@ -372,17 +375,16 @@ class ViewSession(Closing):
     def _fit(self) -> None:
         """Fit the surfaces that are shown in the background, and show them."""
 
-        def fit_scans(job: Job) -> None:
+        def fit_scans(job: Job) -> list[str]:
             with self._lock:
                 state = self.model.state
-            lines = self.painter.fit_scans(state, job.progress)
-            with self._lock:
-                if not job.cancelled():
-                    self.model.set_fitted(True)
-                    self._said = "; ".join(lines)
-            self._changed()
+            return self.painter.fit_scans(state, job.progress)
 
-        self._work.ask("fit", fit_scans, rank=3)
+        def show_fits(lines: list[str]) -> None:
+            self.model.set_fitted(True)
+            self._said = "; ".join(lines)
+
+        self._do_later("fit", fit_scans, show_fits)
 
     def find_spine(self) -> None:
         """Find the canal of the spine in the first scan in the background, and add it as a curve."""
@@ -390,15 +392,11 @@ class ViewSession(Closing):
             raise UsageError("there is no scan: a spine is found in one")
         volume = self.model.scans[0].volume
 
-        def find_line(job: Job) -> None:
-            line = find_spine_line(volume, progress=job.progress)
-            with self._lock:
-                if not job.cancelled():
-                    self.model.add_curve([as_point(point) for point in line.points], "spine")
-                    self._said = "the picture along the spine follows the middle of its canal"
-            self._changed()
+        def add_line(line: SpineLine) -> None:
+            self.model.add_curve([as_point(point) for point in line.points], "spine")
+            self._said = "the picture along the spine follows the middle of its canal"
 
-        self._work.ask("spine", find_line, rank=3)
+        self._do_later("spine", lambda job: find_spine_line(volume, progress=job.progress), add_line)
 
     def pick(self, x: float, y: float, size: tuple[int, int], plane: str | None = None) -> dict[str, Any]:
         """Return what is seen at a pixel of the picture, or of a slice."""
