@@ -103,36 +103,19 @@ def compare_bricks(
 
 def fill_holes(chosen: ArrayLike, *, by_slice: bool = False) -> NDArray[np.bool_]:
     """Return the chosen voxels and those that they enclose, (nk, nj, ni): what a flood from beyond never meets."""
+    from scipy.ndimage import binary_fill_holes
+
     bits = np.asarray(chosen, dtype=bool)
-    if by_slice:
-        return np.stack([fill_holes(layer) for layer in bits])
-    beyond = np.pad(~bits, 1, constant_values=True)
-    return ~_flood(beyond, (0,) * bits.ndim)[(slice(1, -1),) * bits.ndim]
+    return np.stack([binary_fill_holes(layer) for layer in bits]) if by_slice else np.asarray(binary_fill_holes(bits))
 
 
 def grow(chosen: ArrayLike, voxels: ArrayLike) -> NDArray[np.bool_]:
+    """Return the components that hold one of the voxels (n, 3), (nk, nj, ni)."""
+    from scipy.ndimage import label
+
     bits = np.asarray(chosen, dtype=bool)
-    grown = np.zeros_like(bits)
-    for voxel in np.asarray(voxels).tolist():
-        if not grown[tuple(voxel)]:
-            grown |= _flood(bits, tuple(voxel))
-    return grown
-
-
-def _flood(bits: NDArray[np.bool_], start: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Return the component that holds `start`, one element at a time."""
-    met = np.zeros_like(bits)
-    met[start] = bits[start]
-    open_ends = [start] if bits[start] else []
-    while open_ends:
-        voxel = open_ends.pop()
-        for axis, size in enumerate(bits.shape):
-            for step in (-1, 1):
-                near = (*voxel[:axis], voxel[axis] + step, *voxel[axis + 1 :])
-                if 0 <= near[axis] < size and bits[near] and not met[near]:
-                    met[near] = True
-                    open_ends.append(near)
-    return met
+    components = label(bits)[0]
+    return bits & np.isin(components, components[tuple(np.asarray(voxels).T)])
 
 
 def find_places(volume: Volume, border: tuple[int, int, int] = (0, 0, 0)) -> NDArray[np.float64]:
