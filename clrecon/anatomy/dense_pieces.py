@@ -44,15 +44,11 @@ def find_equipment(cells: Cells, pieces: Regions, chosen: Mask, tissue: Mask) ->
         box, piece = pieces.crop(number, _RING_CELLS)
         # A clip on a rail is one piece with it: without the metal a bar is left.
         bar = piece & ~spread_mask(cells.metal[box] > 0)
-        if _is_metal(cells, box, piece) or _is_bar(bar, cells.mean[box], cells.size_mm[::-1]):
+        metal, dense = (of[box][piece].sum(dtype=np.float64) for of in (cells.metal, cells.dense))
+        if metal >= METAL_SHARE * dense or _is_bar(bar, cells.mean[box], cells.size_mm[::-1]):
             ring = spread_mask(piece, _RING_CELLS) & ~piece
             is_equipment[number] = not ring.any() or tissue[box][ring].mean() < _SOFT_RING
     return is_equipment
-
-
-def _is_metal(cells: Cells, box: tuple[slice, ...], piece: Mask) -> bool:
-    metal, dense = (of[box][piece].sum(dtype=np.float64) for of in (cells.metal, cells.dense))
-    return bool(metal >= METAL_SHARE * dense)
 
 
 def _is_bar(piece: Mask, hu: NDArray[np.float32], size_mm: tuple[float, ...]) -> bool:

@@ -102,15 +102,11 @@ def place_in_header(header: Any, affine: Float64Array) -> None:
     ras = lps_affine_from_ras(affine)
     header.set_xyzt_units(MM)
     header.set_sform(ras, _SCANNER)
-    if _is_rigid(ras):
+    axes = ras[:3, :3] / np.linalg.norm(ras[:3, :3], axis=0)
+    if np.abs(axes.T @ axes - np.eye(3)).max() < 1e-6:
         header.set_qform(ras, _SCANNER)  # cannot hold a shear
     else:
         header["pixdim"][1:4] = column_spacing(affine)
-
-
-def _is_rigid(affine: Float64Array) -> bool:
-    axes = affine[:3, :3] / np.linalg.norm(affine[:3, :3], axis=0)
-    return bool(np.abs(axes.T @ axes - np.eye(3)).max() < 1e-6)
 
 
 def make_nibabel(voxels: NDArray[Any], affine: Float64Array) -> Any:

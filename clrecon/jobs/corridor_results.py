@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.geometry import Volume, frame_from_lps
+from clrecon.geometry.affine import Float64Array
 from clrecon.jobs.run import ScanReport
 from clrecon.mesh import Mesh
 from clrecon.rendering.pictures.annotations import PictureData, orientation_letters
@@ -149,8 +150,6 @@ def describe_grade(screw: Screw, grade: ScrewGrade, space: str) -> dict[str, Any
         "front_mm": _round_numbers(grade.front_mm, 2),
     }
 
-
-Float64Array = NDArray[np.float64]
 
 _WIDTH_MM = 96.0
 PIXELS = 400

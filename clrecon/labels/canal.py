@@ -181,14 +181,11 @@ def _find_front(solid: Bits, main: Bits, places: _Places) -> tuple[Bits, Float64
         if len(rows) < 3:
             break
         middles = np.array([_front_of(front[n], places.x(int(n)), places.y(int(n))) for n in rows])
-        slope = np.clip(_slopes(places.heights[rows], middles), -STEEPEST, STEEPEST)
+        # the median of the slopes between all pairs (Theil and Sen): slices with gaps beside the canal are few
+        i, j = np.triu_indices(len(rows), 1)
+        slopes = (middles[j] - middles[i]) / (places.heights[rows[j]] - places.heights[rows[i]])[:, None]
+        slope = np.clip(np.median(slopes, axis=0), -STEEPEST, STEEPEST)
     return front, slope, wall
-
-
-def _slopes(heights: Float64Array, middles: Float64Array) -> Float64Array:
-    """Return the median of the slopes between all pairs (Theil and Sen): slices with gaps beside the canal are few."""
-    i, j = np.triu_indices(len(heights), 1)
-    return np.asarray(np.median((middles[j] - middles[i]) / (heights[j] - heights[i])[:, None], axis=0))
 
 
 def _front_of(section: Bits, x: Float64Array, y: Float64Array) -> tuple[float, float]:

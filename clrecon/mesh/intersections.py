@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.geometry.affine import Float64Array
 from clrecon.mesh.triangles import corner_edges, cross_product
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.pieces import in_threads, local_origin
@@ -31,8 +32,6 @@ _CELLS_FOR_ONE = 64
 
 _ROUNDING = 2.0**-50
 """Share of the sum of its absolute terms that the rounding of a volume or an area does not reach (Shewchuk 1997)."""
-
-Float64Array = NDArray[np.float64]
 
 
 def find_self_intersections(

@@ -8,10 +8,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.geometry.affine import Float64Array
 from clrecon.system.pieces import chunks
 
 IntArray = NDArray[np.integer]
-Float64Array = NDArray[np.float64]
 
 ASIDE = np.array([1.4142e-5, 1.7321e-5])
 """Steps by which a surface is moved, so that no line meets a vertex: a surface has its own on lines of the grid."""

@@ -184,12 +184,6 @@ def fill_bone(part: Part, level: float) -> Mask:
     return np.asarray((bone & part.within & (np.abs(part.aside) <= BESIDE_MM)) | dense)
 
 
-def _find_ribs(part: Part, bone: Mask) -> Mask:
-    """Return the bone beside the bodies that joins bone far beside them."""
-    beside = Regions(bone & part.beside, FACES)
-    return beside.cells_of(beside.sum_of(np.abs(part.aside) >= _RIB_MM[0]) > 0)
-
-
 def divide(
     part: Part, bone: Mask, bounds: list[Bound], planes: Planes, volume: Volume
 ) -> tuple[NDArray[np.uint8], Float64Array, Float64Array]:
@@ -205,7 +199,8 @@ def divide(
     """
     from scipy.ndimage import distance_transform_edt, gaussian_filter
 
-    ribs = _find_ribs(part, bone)
+    beside = Regions(bone & part.beside, FACES)  # bone beside the bodies that joins bone far beside them: ribs
+    ribs = beside.cells_of(beside.sum_of(np.abs(part.aside) >= _RIB_MM[0]) > 0)
     bone = bone & (np.abs(part.aside) <= BESIDE_MM)
     markers = _mark_bodies(part, bone, planes, volume)
     ridge = _ridges(part, bounds)

@@ -224,16 +224,6 @@ def _split_text(text: str, separator: str) -> list[str]:
     return [part.strip() for part in parts]
 
 
-def _describe_kinds(kinds: list[tuple[str, Accepts]]) -> str:
-    words = list(dict.fromkeys(word for word, _ in kinds))
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} or {words[-1]}"
-
-
-def _advise(kinds: list[tuple[str, Accepts]]) -> str:
-    """Return where the first kind that is an object of clrecon comes from."""
-    return next((f": {_MAKERS[word]}" for word, _ in kinds if word in _MAKERS), "")
-
-
 def explains_arguments(function: Callable[Given, Made]) -> Callable[Given, Made]:
     """Turn the foreign error of a public function into a `UsageError` where an argument is not of the annotated kind.
 
@@ -261,8 +251,10 @@ def explains_arguments(function: Callable[Given, Made]) -> Callable[Given, Made]
             for name, value in given.items():
                 kinds = checked.get(name)
                 if kinds is not None and not any(accepts(value) for _, accepts in kinds):
-                    wanted = f"{name} must be {_describe_kinds(kinds)}, not {_name_value(value)}{_advise(kinds)}"
-                    raise UsageError(wanted) from error
+                    *others, last = dict.fromkeys(word for word, _ in kinds)
+                    wanted = f"{', '.join(others)} or {last}" if others else last
+                    maker = next((f": {_MAKERS[word]}" for word in (*others, last) if word in _MAKERS), "")
+                    raise UsageError(f"{name} must be {wanted}, not {_name_value(value)}{maker}") from error
             raise
 
     return call

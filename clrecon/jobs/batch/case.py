@@ -90,7 +90,8 @@ def make_case(case: Case, plan: Plan) -> Answer:
     if earlier and earlier["status"] in (DONE, GATE, REFUSED) and (silence or (key and earlier["key"] == key)):
         return Answer(earlier["status"], kept=True, error=silence or (earlier["error"] or {}).get("message", ""))
     with _folder_in_place(case, plan) as folder:
-        _forget_peak_memory()
+        with suppress(OSError):  # the largest memory begins anew: Linux measures that of each case, others that of all
+            Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
         with Run(plan) as run:
             report = _make_or_fail(case, plan, run, folder, key)
         return Answer(report.status, error=(report.error or {}).get("message", ""))
@@ -242,12 +243,6 @@ def _write_report(run: Run, folder: Path, warnings: Sequence[str] = (), **entrie
     with stage_report(folder / REPORT, report) as file:
         file.commit()
     return report
-
-
-def _forget_peak_memory() -> None:
-    """Let the largest memory of this process begin anew: Linux measures that of each case, others that of all."""
-    with suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
 
 
 def run_worker() -> NoReturn:

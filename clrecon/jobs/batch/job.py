@@ -95,7 +95,10 @@ def run_batch(
         if asked.part is None:
             counts, names = write_cohort(cases, plan)
             if names:
-                warn(f"{counts[MISSING]:,} of {len(cases):,} cases are missing: {_list_names(names, counts[MISSING])}")
+                more = counts[MISSING] - len(names)
+                named = f"{', '.join(names)}{f' and {more:,} more, all in {TABLE}' if more > 0 else ''}"
+                retry = f"{name_parameter('retry', MISSING)} runs them"
+                warn(f"{counts[MISSING]:,} of {len(cases):,} cases are missing: {named}; {retry}")
             run.lap("table")
         statuses = dict(counts.most_common())
         return run.report(BatchReport, (), cases=len(chosen), made=made_count, kept=kept_count, statuses=statuses)
@@ -153,12 +156,6 @@ def _open_output(plan: Plan, cases: Sequence[Case]) -> Path:
 def _find_status(case: Case, plan: Plan) -> str:
     report = read_report(plan.folder_of(case))
     return MISSING if report is None else str(report["status"])
-
-
-def _list_names(names: Sequence[str], count: int) -> str:
-    """List the first names of cases that have not run, and say how all of them are run."""
-    more = f" and {count - len(names):,} more, all in {TABLE}" if count > len(names) else ""
-    return f"{', '.join(names)}{more}; {name_parameter('retry', MISSING)} runs them"
 
 
 def _count_cases(number: int, total: int, seconds: float | None) -> str:

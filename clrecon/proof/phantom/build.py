@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import OutputError, UsageError
 from clrecon.geometry import column_spacing, signed_tilt
+from clrecon.geometry.affine import Float64Array
 from clrecon.proof.phantom import sampling, scenes
 from clrecon.proof.phantom.scene_plans import plan_scene
 from clrecon.proof.phantom.series import RESCALE_INTERCEPT, Placement, place_slices, write_label_map, write_series
@@ -28,8 +29,6 @@ from clrecon.system.paths import existing_stay, place_folder, read_regular, refu
 from clrecon.system.progress import Progress
 from clrecon.system.text import count_of
 from clrecon.version import package_version
-
-Float64Array = NDArray[np.float64]
 
 
 def facts_of_spine(anatomy: Anatomy, affine: Float64Array, settings: PhantomSettings) -> dict[str, Any]:
@@ -144,6 +143,7 @@ def _make_voxels(
     if scanner.padding is not None:
         voxels[:, sampling.outside_disc(field.shape[1:], affine)] = scanner.padding
     ghosts = draw_ghosts(voxels, settings.seed) if settings.ghosts else None
+    suggested = _SPINE_ISO_HU if settings.kind == "spine" else scenes.DENSE_HU
     truth: dict[str, Any] = {
         "schema": "clrecon-phantom-1",
         "generator": _GENERATOR,
@@ -154,7 +154,7 @@ def _make_voxels(
         "spacing_mm": list(column_spacing(affine)),
         "slice_gap_along_normal_mm": float(placement.slice_thickness),
         "tilt_deg": signed_tilt(affine),
-        "iso_value_hu": _iso_value(settings, half_maximum),
+        "iso_value_hu": suggested if half_maximum is None else half_maximum,
         "half_maximum_hu": half_maximum,
         "surface": surface,
         "spine": spine,
@@ -170,12 +170,6 @@ def _make_voxels(
         truth["series"] = series
         truth["shape_ijk"][2] = len(series["slice_positions_lps_mm"])
     return voxels, truth, labels
-
-
-def _iso_value(settings: PhantomSettings, half_maximum: float | None) -> float:
-    if half_maximum is not None:
-        return half_maximum
-    return _SPINE_ISO_HU if settings.kind == "spine" else scenes.DENSE_HU
 
 
 def make_phantom(

@@ -12,6 +12,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.geometry.affine import Float64Array
+
 Field = NDArray[np.float32]
 Point = tuple[float, float, float]
 
@@ -95,7 +97,6 @@ def waves_at(x: Field, y: Field, z: Field, waves: NDArray[np.float64]) -> Field:
     return total
 
 
-Float64Array = NDArray[np.float64]
 Function = Callable[[Float64Array], Float64Array]
 
 _DELTA_MM = 1e-5

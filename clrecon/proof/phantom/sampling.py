@@ -18,12 +18,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
 from clrecon.geometry import apply_affine, column_spacing
-from clrecon.geometry.affine import checked_affine
+from clrecon.geometry.affine import Float64Array, checked_affine
 from clrecon.proof.phantom.shapes import Body
 from clrecon.system.progress import Progress
 
 Float32Array = NDArray[np.float32]
-Float64Array = NDArray[np.float64]
 
 _CHUNK = 1 << 21
 """Points evaluated at once: bounds the scratch memory to some hundred MB."""

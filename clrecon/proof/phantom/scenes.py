@@ -22,11 +22,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clrecon.geometry import column_spacing
-from clrecon.proof.phantom.fields import Field, capsule, coverage, ellipse, ellipsoid
+from clrecon.geometry.affine import Float64Array
+from clrecon.proof.phantom.fields import Field, Point, capsule, coverage, ellipse, ellipsoid
 from clrecon.proof.phantom.settings import CENTRE_LPS_MM, PhantomSettings
 from clrecon.system.progress import Progress
-
-Float64Array = NDArray[np.float64]
 
 
 class Window:
@@ -80,7 +79,6 @@ def paint(canvas: Field, region: tuple[slice, slice], share: Field, hu: float | 
 
 Float32Array = NDArray[np.float32]
 LabelArray = NDArray[np.uint8]
-Point = tuple[float, float, float]
 
 MATERIALS = ("air", "tissue", "bone", "contrast", "metal", "water", "table")
 """Materials of the parts; the label of a voxel is the index in this tuple."""

@@ -23,15 +23,13 @@ from numpy.typing import NDArray
 
 from clrecon.errors import OutputError, UsageError
 from clrecon.geometry import compose_affine
+from clrecon.geometry.affine import Float64Array
 from clrecon.proof.phantom.settings import CENTRE_LPS_MM, KINDS, PhantomSettings, make_localizer
 from clrecon.proof.phantom.spine_plan import slice_directions
 from clrecon.system.progress import Progress
 
 if TYPE_CHECKING:
     from pydicom.dataset import FileDataset
-
-
-Float64Array = NDArray[np.float64]
 
 
 def format_decimal(value: float) -> str:

@@ -17,9 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
 from clrecon.geometry import apply_affine
+from clrecon.geometry.affine import Float64Array
 from clrecon.proof.phantom.settings import PhantomSettings
-
-Float64Array = NDArray[np.float64]
 
 
 def _vector(name: str, value: ArrayLike) -> Float64Array:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.geometry import column_spacing
+from clrecon.geometry.affine import Float64Array
 from clrecon.proof.phantom.fields import Field, capsule, coverage, ellipse, ellipsoid, waves_at
 from clrecon.proof.phantom.scenes import Part, PlacedPiece, Plan, Window, lay_under, paint, plan_subslices
 from clrecon.proof.phantom.settings import CENTRE_LPS_MM, PhantomSettings
@@ -205,7 +206,6 @@ def _draw_vessels(painter: _Painter, from_x: Field, from_y: Field, z: Field, nec
         painter.fill(np.minimum(windpipe, np.float32(60.0) * (neck - np.float32(0.5))), AIR_HU)
 
 
-Float64Array = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 
 CORTEX_HU = 1050.0

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
+from clrecon.geometry.affine import Float64Array
 
 THORACOLUMBAR = tuple([f"T{n}" for n in range(1, 13)] + [f"L{n}" for n in range(1, 6)])
 """Vertebrae of chest and loin from top to bottom: those of a spine phantom without a choice of levels."""
@@ -73,8 +74,6 @@ def format_levels(names: tuple[str, ...]) -> str:
             parts.append([number])
     return ",".join(LEVELS[p[0]] if len(p) == 1 else f"{LEVELS[p[0]]}-{LEVELS[p[-1]]}" for p in parts)
 
-
-Float64Array = NDArray[np.float64]
 
 _KEYS = [THORACOLUMBAR.index(name) for name in ("T1", "T6", "T12", "L1", "L3", "L5")]
 _SIZES = {

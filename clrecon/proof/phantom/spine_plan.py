@@ -8,13 +8,11 @@ import dataclasses
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
+from clrecon.geometry.affine import Float64Array
 from clrecon.proof.phantom import spine_parts
 from clrecon.proof.phantom.vertebra import body_extent, bone_extent, centring_shift, close_facets
-
-Float64Array = NDArray[np.float64]
 
 
 def slice_directions(

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import ClreconError, UsageError
+from clrecon.geometry.affine import Float64Array
 from clrecon.proof.phantom.build import LARGEST_TRUTH, TRUTH_NAME, is_phantom_truth
 from clrecon.proof.phantom.fields import Function, gradient_of
 from clrecon.proof.phantom.series import place_slices
@@ -30,8 +31,6 @@ from clrecon.proof.phantom.vertebra import local_bounds, vertebra_distance, vert
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.paths import read_regular
 from clrecon.system.text import escape_text
-
-Float64Array = NDArray[np.float64]
 
 _STEP_MM = 1.0
 _RIM_PARTS = 5

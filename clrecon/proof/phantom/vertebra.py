@@ -16,12 +16,11 @@ from functools import reduce
 from itertools import product
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from clrecon.proof.phantom.fields import Field, capsule, ellipse, nearest_on_surface, smooth_union
+from clrecon.geometry.affine import Float64Array
+from clrecon.proof.phantom.fields import Field, Point, capsule, ellipse, nearest_on_surface, smooth_union
 from clrecon.proof.phantom.spine_parts import SpineChoice, Vertebra, level_number
-
-Point = tuple[float, float, float]
 
 
 def cervical_bounds(vertebra: Vertebra) -> tuple[Point, Point]:
@@ -294,8 +293,6 @@ def vertebra_distance(vertebra: Vertebra, x: Field, y: Field, z: Field) -> Field
         bone = np.minimum(bone, -cut)
     return bone
 
-
-Float64Array = NDArray[np.float64]
 
 _STEP_MM = 3.0
 _RIM_MM = 1.0

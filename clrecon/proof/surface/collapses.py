@@ -12,6 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.geometry.affine import Float64Array
+
 PULL = 1e-3
 """Weight of the middle of an edge in cl/surface/collapse.h."""
 
@@ -28,8 +30,6 @@ _UNSURE = 1e-3
 
 _SAMPLES = 9
 """Points of each new edge."""
-
-Float64Array = NDArray[np.float64]
 
 
 class Surroundings(NamedTuple):

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.geometry import Volume, slice_normal
-
-Float64Array = NDArray[np.float64]
+from clrecon.geometry.affine import Float64Array
 
 SAMPLES, CENTRE = 13, 7
 FRAME = 2

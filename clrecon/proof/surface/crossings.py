@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Float64Array = NDArray[np.float64]
+from clrecon.geometry.affine import Float64Array
 
 
 def mark_crossings(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> NDArray[np.bool_]:
