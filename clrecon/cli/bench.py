@@ -45,8 +45,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         runs=options.runs,
         series=options.series,
         report_path=options.report,
-        no_clobber=options.no_clobber,
-        progress=console.progress,
+        **common.run_options(options, console),
     )
     lines = _describe_bench(result)
     common.show_report(result, [*lines, ""] if options.report else lines, options, console)

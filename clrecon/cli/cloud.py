@@ -68,7 +68,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     clusters = None if options.clusters is None else Clustering(**options.clusters)
     settings = common.make_settings(CloudSettings, options, clusters=clusters)
     files = CloudFiles(options.output, options.removed, options.surface, options.report)
-    report = make_cloud(options.input, files, settings, no_clobber=options.no_clobber, progress=console.progress)
+    report = make_cloud(options.input, files, settings, **common.run_options(options, console))
     paths, space = {"cloud": options.output, "removed": options.removed, "surface": options.surface}, report["space"]
     written = [
         f"wrote    {printable(paths[entry['what']])}, {format_bytes(entry['bytes'])}, {space.upper()} mm"

@@ -229,6 +229,11 @@ def make_settings(settings: type[Settings], options: argparse.Namespace, **more:
     return settings(**pick(options, settings) | more)
 
 
+def run_options(options: argparse.Namespace, console: Console) -> dict[str, Any]:
+    """Return what every job is told beside its settings; see `clrecon.jobs.run.Run`."""
+    return {"no_clobber": options.no_clobber, "progress": console.progress}
+
+
 def add_fields(
     container: argparse._ActionsContainer, settings: type, *groups: str, without: Container[str] = ()
 ) -> None:

@@ -58,9 +58,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
             raise UsageError("methods are compared at one iso value: give --hu one number, auto or half:B,T")
         given["iso_value"] = levels[0]
     settings = CompareSettings(**given)
-    report = make_comparison(
-        options.input, options.output, settings, no_clobber=options.no_clobber, progress=console.progress
-    )
+    report = make_comparison(options.input, options.output, settings, **common.run_options(options, console))
     named = [method[which] for method, which in product(report["methods"], ("picture", "difference"))]
     pictures = sum(name is not None for name in named) + 2 * len(report["slices"])
     written = f"wrote    {printable(options.output)}: index.html, report.json and {pictures} pictures"

@@ -62,8 +62,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         options.input,
         common.make_settings(CorridorSettings, options, screws=screws),
         MeshFiles(options.output, options.picture, options.report),
-        no_clobber=options.no_clobber,
-        progress=console.progress,
+        **common.run_options(options, console),
     )
     files = _name_files(report, options.output, options.picture)
     written = [f"wrote    {printable(path)}, {format_bytes(size)}" for path, size in files]

@@ -24,9 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, console: Console) -> int:
     from clrecon.proof.demo import DEMO_FOLDER, make_demo
 
-    outcome = make_demo(
-        options.output or DEMO_FOLDER, options.device, no_clobber=options.no_clobber, progress=console.progress
-    )
+    outcome = make_demo(options.output or DEMO_FOLDER, options.device, **common.run_options(options, console))
     common.show_report(outcome, _summary(outcome), options, console, of="mesh")
     return 0
 

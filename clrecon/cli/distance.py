@@ -48,8 +48,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         options.reference,
         MeshFiles(options.output, options.picture, options.report),
         common.make_settings(DistanceSettings, options),
-        no_clobber=options.no_clobber,
-        progress=console.progress,
+        **common.run_options(options, console),
     )
     common.show_report(report, _describe_distance(report), options, console)
     return 0

@@ -48,8 +48,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         options.output,
         common.make_settings(ExportSettings, options),
         report_path=options.report,
-        no_clobber=options.no_clobber,
-        progress=console.progress,
+        **common.run_options(options, console),
     )
     output = report["output"]
     size, space = format_bytes(output["bytes"]), output["space"].upper()

@@ -8,7 +8,7 @@ from typing import Any
 
 from clrecon.cli import common
 from clrecon.cli.console import Console, printable
-from clrecon.jobs.outputs import MESH_FILES, name_outputs
+from clrecon.jobs.outputs import MESH_FILES, MeshFiles, name_outputs
 from clrecon.jobs.settings import InsideSettings
 from clrecon.system.records import describe_volume
 from clrecon.system.text import format_bytes, format_volume
@@ -55,12 +55,9 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
     report = make_inside(
         options.input,
-        options.output,
+        MeshFiles(options.output, options.picture, options.report),
         common.make_settings(InsideSettings, options),
-        picture=options.picture,
-        report_path=options.report,
-        no_clobber=options.no_clobber,
-        progress=console.progress,
+        **common.run_options(options, console),
     )
     files = list(chain(*(vertebra["meshes"] for vertebra in report["vertebrae"])))
     size = format_bytes(sum(mesh["bytes"] for mesh in files))

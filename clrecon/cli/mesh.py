@@ -107,10 +107,9 @@ def run(options: argparse.Namespace, console: Console) -> int:
         options.output,
         settings,
         report_path=options.report,
-        no_clobber=options.no_clobber,
         measure=bool(options.report or options.json or options.verbose),
         store=options.store,
-        progress=console.progress,
+        **common.run_options(options, console),
     )
     console.result(report)
     for line in describe_mesh(report):

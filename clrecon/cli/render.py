@@ -302,9 +302,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         options.mode = "mesh" if holds_triangles(options.input) and not asks_points else "points"
     if options.mode is None and (options.color in MESH_COLORS or holds_triangles(options.input)):
         options.mode = "mesh"
-    report = make_pictures(
-        options.input, files, render_settings(options), no_clobber=options.no_clobber, progress=console.progress
-    )
+    report = make_pictures(options.input, files, render_settings(options), **common.run_options(options, console))
     lines = []
     for entry, path in (("output", files.picture), ("depth_output", files.depth), ("values_output", files.values)):
         for picture in report["pictures"]:

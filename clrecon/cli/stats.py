@@ -49,8 +49,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         common.make_settings(StatsSettings, options),
         report_path=options.report,
         csv_path=options.csv,
-        no_clobber=options.no_clobber,
-        progress=console.progress,
+        **common.run_options(options, console),
     )
     width = shutil.get_terminal_size().columns if is_terminal(sys.stdout) else None
     lines = [

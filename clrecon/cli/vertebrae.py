@@ -54,8 +54,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         with_picture=with_picture,
         report_path=options.report,
         store=options.store,
-        no_clobber=options.no_clobber,
-        progress=console.progress,
+        **common.run_options(options, console),
     )
     lines = _describe_split(report)
     if settings.name_at is None and settings.first is None:

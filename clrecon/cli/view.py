@@ -94,9 +94,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     from clrecon.jobs.view.job import write_view
 
     settings = _settings(options)
-    report = write_view(
-        options.inputs, options.html, settings, no_clobber=options.no_clobber, progress=console.progress
-    )
+    report = write_view(options.inputs, options.html, settings, **common.run_options(options, console))
     common.show_report(report, _describe_view(report, options.html), options, console)
     return 0
 

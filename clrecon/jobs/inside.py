@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from clrecon.jobs.outputs import check_files, check_kept, check_outputs, name_outputs, refuse_files
+from clrecon.jobs.outputs import MeshFiles, check_files, check_kept, check_outputs, name_outputs, refuse_files
 from clrecon.jobs.run import DeviceOpening, Run, RunReport, trial_cube
 from clrecon.jobs.settings import InsideSettings
 from clrecon.system.light_dataclass import dataclass, field
@@ -84,15 +84,7 @@ class InsideReport(RunReport):
     unit: str = "mm"
 
 
-def make_inside(
-    source: str | Path,
-    output: str | Path,
-    settings: InsideSettings,
-    *,
-    picture: str | Path | None = None,
-    report_path: str | Path | None = None,
-    **how: Any,
-) -> InsideReport:
+def make_inside(source: str | Path, files: MeshFiles, settings: InsideSettings, **how: Any) -> InsideReport:
     """Read a CT series and its labels, look into vertebrae, and write the surfaces of their parts, a file each."""
     from clrecon.labels import file_suffixes
     from clrecon.operators.vertebrae.inside import PARTS
@@ -100,7 +92,7 @@ def make_inside(
 
     with Run(settings, **how) as run:
         with run.keeping():
-            _check_files(source, output, picture, report_path, settings)
+            _check_files(source, files, settings)
         run.progress("device", 0, 0)
         with DeviceOpening(settings.device, _try_masks) as opening:
             volume, labels = run.read_labelled(source)
@@ -110,7 +102,7 @@ def make_inside(
         several = len(suffixes) > 1
         if run.no_clobber:
             names = [name_part(suffix, part, several=several) for suffix, part in product(suffixes, PARTS)]
-            refuse_files(name_outputs(output, names) + ([] if picture is None else name_outputs(picture, names)))
+            refuse_files([*chain(*(name_outputs(path, names) for path in (files.output, files.picture) if path))])
         run.lap("read")
         items: list[_FoundVertebra] = []
         for number, suffix in zip(numbers, suffixes, strict=True):
@@ -118,12 +110,12 @@ def make_inside(
             inside = _look_inside(volume, labels, number, settings, device)
             items.append(_FoundVertebra(suffix, inside, inside.extract_meshes(memory=settings.memory)))
         run.lap("inside")
-        if picture is not None:
+        if files.picture is not None:
             for order, item in enumerate(items):
                 run.progress("render", order, len(items) if several else 0)
                 item.pictures = draw_parts(item.meshes, settings.view, device, settings.memory)
             run.lap("render")
-        vertebrae = [_write_vertebra(run, one, output, picture, report_path, several=several) for one in items]
+        vertebrae = [_write_vertebra(run, one, files, several=several) for one in items]
         run.lap("write")
         warnings = [
             f"{vertebra['name']}: {warning}" if several else warning
@@ -140,7 +132,7 @@ def make_inside(
             close_mm=settings.close_mm or CLOSE_MM,
             space=settings.space.lower(),
         )
-        run.finish(report, report_path)
+        run.finish(report, files.report)
     log.info("%d vertebrae looked into, on %s in %.3f s", len(items), report.device, report.seconds["total"])
     return report
 
@@ -155,22 +147,17 @@ class _FoundVertebra:
     pictures: dict[str, Rendering] = field(default_factory=dict)
 
 
-def _check_files(
-    source: str | Path,
-    output: str | Path,
-    picture: str | Path | None,
-    report_path: str | Path | None,
-    settings: InsideSettings,
-) -> None:
+def _check_files(source: str | Path, files: MeshFiles, settings: InsideSettings) -> None:
     """Refuse outputs that cannot be written or would replace an input."""
     from clrecon.operators.vertebrae.inside import PARTS
 
     # names of several vertebrae are those of the label map, which is not read yet: their number stands for them
     first = [part if len(settings.label) == 1 else f"{len(settings.label)}_{part}" for part in PARTS]
-    outputs = check_outputs(output, report_path, first)
-    if picture is not None:
-        check_pictures(picture, settings.view)
-        outputs += [("the picture", path) for path in name_outputs(picture, first)]
+    assert files.output is not None
+    outputs = check_outputs(files.output, files.report, first)
+    if files.picture is not None:
+        check_pictures(files.picture, settings.view)
+        outputs += [("the picture", path) for path in name_outputs(files.picture, first)]
         check_files(outputs)
     check_kept(outputs, source, settings.labels)
 
@@ -201,19 +188,11 @@ def _look_inside(
     )  # fmt: skip
 
 
-def _write_vertebra(
-    run: Run,
-    vertebra: _FoundVertebra,
-    output: str | Path,
-    picture: str | Path | None,
-    report_path: str | Path | None,
-    *,
-    several: bool,
-) -> dict[str, Any]:
+def _write_vertebra(run: Run, vertebra: _FoundVertebra, files: MeshFiles, *, several: bool) -> dict[str, Any]:
     entry: dict[str, Any] = {**vertebra.inside.as_dict(), "name": vertebra.suffix, "pictures": []}
-    paths = name_outputs(
-        output, [name_part(vertebra.suffix, part, several=several) for part in vertebra.meshes], report_path
-    )
+    assert files.output is not None
+    names = [name_part(vertebra.suffix, part, several=several) for part in vertebra.meshes]
+    paths = name_outputs(files.output, names, files.report)
     written = run.write_meshes(list(vertebra.meshes.values()), paths)
     entry["meshes"] = [
         {
@@ -226,8 +205,8 @@ def _write_vertebra(
         for (part, mesh), path, file in zip(vertebra.meshes.items(), paths, written, strict=True)
     ]
     for part, drawn in vertebra.pictures.items():
-        assert picture is not None
-        (path,) = name_outputs(picture, [name_part(vertebra.suffix, part, several=several)])
+        assert files.picture is not None
+        (path,) = name_outputs(files.picture, [name_part(vertebra.suffix, part, several=several)])
         size = run.write_picture(path, drawn).size
         of_picture = {"part": part, "faded": list(_FADED[part]), "size": list(drawn.size)}
         entry["pictures"].append(of_picture | {"format": extension_of(path)[1:], "bytes": size})

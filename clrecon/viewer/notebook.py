@@ -26,12 +26,9 @@ from clrecon.system.base_classes import Closing
 from clrecon.system.log import get_logger
 
 if TYPE_CHECKING:
-    from clrecon.geometry import Volume
     from clrecon.jobs.view import ViewSettings
     from clrecon.labels import LabelMap
     from clrecon.mesh import Mesh
-    from clrecon.points.cloud import PointCloud
-    from clrecon.reading.common.source_facts import SeriesListing
     from clrecon.rendering import Rendering
     from clrecon.viewer.model.objects import ShownObject
 
