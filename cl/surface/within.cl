@@ -26,7 +26,8 @@
 
 /* Parameters  places   in   (n, 3) mm
  *             faces    in   (faces, 3)
- *             frames   out  (3 faces,) of each face the first corner and the edges from it
+ *             frames   out  (3 faces,) of each face the first corner, with the square of its longest edge, and the edges
+ *                      from it
  *             rows     in   (count,) the faces that are looked at
  *             count
  * Launch      global = count, rounded up by the host, any local
@@ -42,7 +43,8 @@ __kernel void frame_faces(
     const uint3 corners = vload3(face, faces);
     const float3 one = place_of(places, corners.x);
     const float3 p = place_of(places, corners.y) - one, q = place_of(places, corners.z) - one;
-    frames[3u * face] = (float4)(one, 0.0f);
+    const float3 r = q - p;
+    frames[3u * face] = (float4)(one, max(max(dot3(p, p), dot3(q, q)), dot3(r, r)));
     frames[3u * face + 1u] = (float4)(p, 0.0f);
     frames[3u * face + 2u] = (float4)(q, 0.0f);
 }
@@ -148,6 +150,13 @@ static inline __attribute__((always_inline)) int is_near_all(
 }
 #endif
 
+/* True where an edge of a piece is longer than each of a face: then hardly any face there is near to all of it. */
+static inline int exceeds_face(const target *to, const triangle *piece, const int face)
+{
+    const float3 a = piece->b - piece->a, b = piece->c - piece->b, c = piece->a - piece->c;
+    return max(max(dot3(a, a), dot3(b, b)), dot3(c, c)) > to->frames[3 * face].w;
+}
+
 /* Walk from a vertex to a face that is nearest among all that touch it, or nearer than `enough`; the square of its
  * distance.  Within the limit only those around one corner are looked at, unless `enough` is 0.  (rusticl of Mesa 22 goes
  * wrong where such a loop ends in its middle.) */
@@ -204,32 +213,35 @@ __kernel void find_near_faces(
     const target to = {places, faces, begin, around, frames, stars};
     const int4 hint = vload4(number, hints);
     int4 used = {NO_FACE, NO_FACE, NO_FACE, NO_FACE};
-    int face = hint.x, from = hint.x == NO_FACE ? hint.y : (int)faces[3u * (uint)hint.x], uses = 0;
+    int face = hint.x, from = hint.y, uses = 0;
     uint path = 0, cuts = 0;
     int is_going = 1, is_far = 0;
-    triangle now;
+    triangle now, whole; /* the piece that is looked at, and that of which it is the first half */
     find_piece(triangles, number, path, cuts, &now);
     for (uint piece = 0; is_going; ++piece) {
         /* the last face, and those of pieces before */
-        const int is_last = used.x == face, before = is_last ? used.y : used.x, third = is_last ? NO_FACE : used.y;
+        const int is_last = used.x == face, before = is_last ? used.y : used.x;
+        const int third = is_last ? used.z : used.y, fourth = is_last ? used.w : used.z;
+        const int is_wide = face != NO_FACE && exceeds_face(&to, &now, face);
         int is_near = 0;
-        if (face != NO_FACE) {
+        if (face != NO_FACE && !is_wide) {
             is_near = is_near_all(&to, &now, face, before == NO_FACE ? face : before, limit);
             if (is_near == 0 && third != NO_FACE)
-                is_near = is_near_all(&to, &now, third, third, limit) << 2;
-            face = (is_near & 1) ? face : (is_near & 2) ? before : is_near ? third : face;
+                is_near = is_near_all(&to, &now, third, fourth == NO_FACE ? third : fourth, limit) << 2;
+            face = (is_near & 1) ? face : (is_near & 2) ? before : (is_near & 4) ? third : is_near ? fourth : face;
         }
-        if (!is_near) {
+        if (!is_near && !is_wide) {
             const float3 middle = (now.a + now.b + now.c) * (1.0f / 3.0f);
             const float enough = cuts < QUICK_CUTS ? EASY * limit : 0.0f;
             int nearest = NO_FACE;
+            if (face != NO_FACE)
+                from = (int)nearest_corner(&to, middle, face);
             float least = walk_to(&to, middle, from, limit, enough, &nearest);
             for (int corner = 0; corner < 3 && !(least < limit); ++corner)
                 least = walk_to(&to, middle, PICK_3(hint.y, hint.z, hint.w, corner), limit, 0.0f, &nearest);
             is_far = !(least < limit);
             if (!is_far) {
                 face = nearest;
-                from = (int)faces[3u * (uint)nearest];
                 is_near = is_near_all(&to, &now, face, face, limit);
             }
         }
@@ -238,18 +250,23 @@ __kernel void find_near_faces(
                 used = (int4)(face, used.x, used.y, used.z);
                 ++uses;
             }
+            const int is_first = !(path & 1u);
             while (cuts > 0 && (path & 1u)) {
                 path >>= 1;
                 --cuts;
             }
             path |= 1u;
             is_going = cuts > 0;
-            if (is_going)
+            if (LANES == 8 && is_going && is_first) { /* GPUs have no registers left for it */
+                now = whole;
+                halve_piece(&now, 1);
+            } else if (is_going)
                 find_piece(triangles, number, path, cuts, &now);
         } else {
             is_far |= cuts == MOST_CUTS;
             path <<= 1;
             ++cuts;
+            whole = now;
             halve_piece(&now, 0);
         }
         is_far |= piece == MOST_PIECES;
