@@ -13,6 +13,7 @@ from clrecon.jobs.mesh.settings import GATE_FAILED, SCAN_GATE_FAILED, LabelChoic
 from clrecon.jobs.mesh.surfaces import VALUE_GATES, names_level
 from clrecon.jobs.outputs import MESH_FILES, name_outputs
 from clrecon.jobs.presets import PRESETS
+from clrecon.system.processes import keep_freed_memory
 from clrecon.system.records import describe_volume
 from clrecon.system.text import count_of, format_bytes, format_digits, format_ml, format_volume
 
@@ -102,6 +103,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     from clrecon.jobs.mesh.job import make_mesh, makes_objects
 
     settings = settings_from(vars(options))
+    keep_freed_memory()
     report = make_mesh(
         options.input,
         options.output,

@@ -1,4 +1,4 @@
-"""The cores of this process, and processes of the same Python beside it: their start, and how they end."""
+"""The cores and the memory of this process, and processes of the same Python beside it: how they start and end."""
 
 from __future__ import annotations
 
@@ -13,6 +13,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NoReturn
 
 from clrecon.errors import DeviceError
+
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
+"""Parameters of the `mallopt` of glibc."""
+
+_KEPT_BYTES = 1 << 28
+"""Most bytes of an array whose memory is kept when it is freed; larger ones are few."""
 
 _MOST_SECONDS_TO_END = 1.0
 """Time for the removal of temporary folders after a kernel has hung."""
@@ -79,6 +85,17 @@ def describe_end(code: int) -> str:
     name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
     more = ": out of memory, or ended by somebody" if name == "SIGKILL" else ""
     return f"its process crashed with {name}{more}"
+
+
+def keep_freed_memory() -> None:
+    """Have glibc keep what this process frees for its next arrays: the system clears each page that it gives anew."""
+    if sys.platform.startswith("linux"):
+        import ctypes
+
+        program = ctypes.CDLL(None)
+        if hasattr(program, "mallopt"):  # musl has none
+            program.mallopt(_MMAP_THRESHOLD, _KEPT_BYTES)
+            program.mallopt(_TRIM_THRESHOLD, 4 * _KEPT_BYTES)
 
 
 def has_hung_device() -> bool:
