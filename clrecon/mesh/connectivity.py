@@ -18,6 +18,9 @@ from clrecon.system.pieces import in_threads
 _MOST_STEPS = 64
 """Most faces around a vertex that are counted one after the other; vertices with more take the general way."""
 
+_LOOP = np.uint64(2**64 - 1)
+"""In place of the vertices of half-edges that start and end at one."""
+
 IntArray = NDArray[np.integer]
 
 
@@ -212,21 +215,30 @@ class Fans(Lists):
 
 
 def find_edges(triangles: NDArray[np.uint32], vertex_count: int) -> Edges:
+    """Sort half-edges by one number of their lower and their higher vertex and their direction."""
+    if vertex_count > 1 << 31:  # a number of 64 bits holds two vertices of 31
+        used, numbers = np.unique(triangles, return_inverse=True)
+        edges = find_edges(numbers.reshape(-1, 3).astype(np.uint32), len(used))
+        return Edges(**vars(edges) | {"ends": used.take(edges.ends)})
     start = triangles.reshape(-1)
     end = triangles[:, (1, 2, 0)].reshape(-1)
-    upward = start < end
-    half_edges = np.concatenate([np.flatnonzero(upward), np.flatnonzero(start > end)])
-    half_edges = half_edges.astype(_index_type(len(start)), copy=False)
-    low, high = np.minimum(start, end), np.maximum(start, end)
-    for ends in (high, low):  # Least significant number first: each sort keeps the order of the earlier ones.
-        half_edges = half_edges[order_by_number(ends[half_edges], vertex_count)]
-    low, high = low[half_edges], high[half_edges]
-    upward = upward[half_edges]
-    same = low[1:] == low[:-1]
-    same &= high[1:] == high[:-1]
-    oriented = not bool((same & (upward[1:] == upward[:-1])).any())
-    first = np.flatnonzero(np.concatenate([np.ones(min(len(low), 1), dtype=bool), ~same]))
-    uses = np.diff(first, append=len(low))
+    keys = np.minimum(start, end).astype(np.uint64)
+    keys <<= np.uint64(32)
+    keys |= np.maximum(start, end)
+    keys <<= np.uint64(1)
+    keys |= start > end
+    is_loop = start == end
+    keys[is_loop] = _LOOP
+    half_edges = np.argsort(keys)
+    ordered = keys.take(half_edges)
+    if (ordered[1:] == ordered[:-1]).any():  # else there is only one order, which is found sooner
+        half_edges = np.argsort(keys, kind="stable")
+    count = len(start) - int(np.count_nonzero(is_loop))
+    half_edges, ordered = half_edges[:count].astype(_index_type(len(start))), ordered[:count]
+    oriented = not bool((ordered[1:] == ordered[:-1]).any())
+    ordered >>= np.uint64(1)
+    first = np.flatnonzero(np.concatenate([np.ones(min(count, 1), dtype=bool), ordered[1:] != ordered[:-1]]))
+    uses, ends = np.diff(first, append=count), ordered.take(first)
     return Edges(
         count=len(first),
         boundary=int(np.count_nonzero(uses == 1)),
@@ -234,7 +246,7 @@ def find_edges(triangles: NDArray[np.uint32], vertex_count: int) -> Edges:
         oriented=oriented,
         half_edges=half_edges,
         first=first,
-        ends=np.stack([low[first], high[first]]),
+        ends=np.stack([ends >> np.uint64(32), ends & np.uint64(0xFFFFFFFF)]).astype(np.uint32),
     )
 
 
