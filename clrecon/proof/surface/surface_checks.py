@@ -398,7 +398,7 @@ def _check_fits(device: Device) -> str:
         rows = np.stack(sampler.take(values).fit(0.66, 0.81, 980.0, 20.0, finds_place=True).rows())
     precisions = expected_precisions(980.0, 20.0, CORTEX_SPREAD)
     expected = cortex_twin.fit_profiles(
-        values.astype(np.float64), twin_scale(sampler), 0.66, 0.81, 980.0, precisions, 100.0
+        values.astype(np.float64), twin_scale(sampler), 0.66, 0.81, 980.0, precisions, 490.0
     )
     known = np.isfinite(expected[7])
     require_close(rows[7:], expected[7:], 1e-2, "highest values and room of walls")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from refusals import refused
+from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 from surface_volumes import MIDDLE, hollow_ball
 
@@ -79,14 +80,21 @@ def test_fitted_shell_is_nearer_to_bone_than_the_level(fitted_shell):
     assert np.abs(away).mean() < 0.12  # mm; measured 0.02 to 0.05
 
 
-def test_fat_2_mm_outside_of_bone_moves_its_surface_by_less_than_a_sixth_of_a_voxel(device):
+def test_fat_2_mm_outside_of_bone_moves_its_surface_by_less_than_a_seventh_of_a_voxel(device):
     volume = hollow_ball(thickness=1.0)
     away = np.linalg.norm(np.moveaxis(np.indices(volume.voxels.shape)[::-1], 0, -1) - MIDDLE, axis=-1)
     fat = 150.0 * ndtr((away - OUTER_RADIUS - 2.0) / 0.7)
     constants = constants_with_blurs(within_mm=0.8, across_mm=0.8)
     mesh, fit = fit_surface(volume.with_voxels(np.rint(volume.voxels - fat).astype(np.int16)), device, 200.0, constants)
-    # mm; measured 0.147, and 0.194 where samples outside count as much as those inside
-    assert outer_places(mesh, fit)[0].mean() < 0.167
+    # mm; measured 0.110, and 0.194 where samples outside count as much as those inside
+    assert outer_places(mesh, fit)[0].mean() < 0.143
+
+
+def test_the_dark_line_of_an_edge_enhancing_kernel_beside_bone_ends_no_wall(device):
+    voxels = hollow_ball(thickness=2.0, blur=0.5).voxels.astype(np.float32)
+    sharp = np.rint(2.0 * voxels - gaussian_filter(voxels, 1.0)).astype(np.int16)
+    _, fit = fit_surface(Volume(sharp, np.eye(4)), device)
+    assert fit.counts()["no room"] == 0  # 392 where a rise of 100 HU is another wall
 
 
 def test_fitted_shell_has_its_thickness_to_a_third_of_a_voxel(fitted_shell):
@@ -139,15 +147,11 @@ def test_cubic_values_between_slices_find_walls_nearer_to_the_truth_than_linear_
     _, fit_of_thick = fit_surface(thick, device)
     directions = np.random.default_rng(5).normal(size=(800, 3))
     directions /= np.linalg.norm(directions, axis=1)[:, None]
-    points = (
-        MIDDLE - [0.0, 0.0, 1.0] + (OUTER_RADIUS + 0.4) * directions
-    )  # the first mean is that of slices at 0 to 2 mm
+    points = MIDDLE - [0.0, 0.0, 1.0] + (OUTER_RADIUS + 0.4) * directions  # the first mean: slices at 0 to 2 mm
     with DeviceVolume(thick, device=device) as resident:
+        known = {"stopwatch": Stopwatch(), "constants": fit_of_thick.constants}
         linear, cubic = (
-            fit_walls(
-                resident, points, directions, stopwatch=Stopwatch(), constants=fit_of_thick.constants, cubic=cubic
-            ).shift_mm
-            for cubic in (False, True)
+            fit_walls(resident, points, directions, **known, cubic=cubic).shift_mm for cubic in (False, True)
         )
     assert np.abs(cubic + 0.4).mean() < 0.93 * np.abs(linear + 0.4).mean()  # measured 0.136 and 0.157 mm
 
@@ -249,9 +253,7 @@ def test_blur_of_a_fit_scales_with_the_voxels(device):
 def test_cortex_fitted_in_slabs_is_that_of_the_whole(device, uneven, few, cubic):
     volume = stack(hollow_ball(thickness=2.0).voxels, OBLIQUE, uneven=uneven)
     mesh, whole = fit_surface(volume, device, cubic=cubic)
-    assert (
-        mesh.vertex_count > 4 * cortex.SMALLEST_PIECE
-    )  # so that few places at a time are several pieces; measured 3538
+    assert mesh.vertex_count > 4 * cortex.SMALLEST_PIECE  # few places at a time are several pieces; measured 3538
     places = cortex.SMALLEST_PIECE if few else cortex.stride_of(mesh.vertex_count)
     place_bytes = 4 * (cortex.ROWS + cortex.RESULTS) + 32  # what each profile takes on the device
     memory = volume.voxels.nbytes // 2 + place_bytes * places
@@ -341,7 +343,7 @@ def test_walls_unlike_the_cortex_of_the_scan_have_errors_larger_by_a_factor_and_
     np.testing.assert_allclose(standard_errors(wall, constants), factor * standard_errors(usual, constants), rtol=1e-5)
 
 
-@pytest.mark.parametrize(("noise_hu", "error_mm", "state"), [(300.0, 1.4, "fitted"), (700.0, 5.6, "badly fitted")])
+@pytest.mark.parametrize(("noise_hu", "error_mm", "state"), [(300.0, 1.6, "fitted"), (700.0, 6.9, "badly fitted")])
 def test_walls_with_standard_errors_above_2_5_mm_are_badly_fitted(device, noise_hu, error_mm, state):
     noisy = constants_with_blurs(within_mm=0.8, across_mm=0.8).changed(noise_hu=noise_hu)
     _, fit = fit_surface(hollow_ball(thickness=1.0), device, constants=noisy)
