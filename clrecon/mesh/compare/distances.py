@@ -145,28 +145,43 @@ def compare_meshes(
     UsageError
         ``samples`` is below 1.
     """
-    if samples < 1:
-        raise UsageError(f"distances need at least 1 sample, not {samples}")
-    mesh.check()
-    reference.check()
-    sides = []
-    progress = progress or ignore_progress
-    points = [sample_surface(each.vertices, each.triangles, samples) for each in (mesh, reference)]
-    for side, target in enumerate((reference, mesh)):
-        progress("compare", side, 2)
-        sides.append(summarise_distances(SurfaceDistance(target.vertices, target.triangles)(points[side])))
-    progress("compare", 2, 2)
-    origin = local_origin(reference.vertices)
-    volume, wanted = (enclosed_ml(each.vertices, each.triangles, origin) for each in (mesh, reference))
-    return MeshDistance(
-        hd95_mm=max(side.p95 for side in sides),
-        assd_mm=0.5 * (sides[0].mean + sides[1].mean),
-        max_mm=max(side.max for side in sides),
-        to_reference_mm=sides[0],
-        from_reference_mm=sides[1],
-        volume_change_percent=100.0 * (volume - wanted) / abs(wanted) if wanted else None,
-        samples=samples,
-    )
+    return ReferenceSurface(reference, samples).compare(mesh, progress)
+
+
+class ReferenceSurface:
+    """A surface with which others are compared: see `compare_meshes`."""
+
+    def __init__(self, mesh: Mesh, samples: int):
+        if samples < 1:
+            raise UsageError(f"distances need at least 1 sample, not {samples}")
+        mesh.check()
+        self._mesh, self._samples = mesh, samples
+        self._points = sample_surface(mesh.vertices, mesh.triangles, samples)
+        self._origin = local_origin(mesh.vertices)
+        self._volume = enclosed_ml(mesh.vertices, mesh.triangles, self._origin)
+        self.distance = SurfaceDistance(mesh.vertices, mesh.triangles)
+
+    def compare(self, mesh: Mesh, progress: Progress | None = None) -> MeshDistance:
+        """Compare a surface, which may be that of the reference itself."""
+        progress = progress or ignore_progress
+        mesh.check()
+        points = sample_surface(mesh.vertices, mesh.triangles, self._samples)
+        progress("compare", 0, 2)
+        there = back = summarise_distances(self.distance(points))
+        progress("compare", 1, 2)
+        if mesh is not self._mesh:
+            back = summarise_distances(SurfaceDistance(mesh.vertices, mesh.triangles)(self._points))
+        progress("compare", 2, 2)
+        volume, wanted = enclosed_ml(mesh.vertices, mesh.triangles, self._origin), self._volume
+        return MeshDistance(
+            hd95_mm=max(there.p95, back.p95),
+            assd_mm=0.5 * (there.mean + back.mean),
+            max_mm=max(there.max, back.max),
+            to_reference_mm=there,
+            from_reference_mm=back,
+            volume_change_percent=100.0 * (volume - wanted) / abs(wanted) if wanted else None,
+            samples=self._samples,
+        )
 
 
 _WALL_SAMPLES = 20_000

@@ -1,9 +1,11 @@
-"""The process of one method: it runs it, draws what it made, and writes figures as JSON and arrays as files."""
+"""The processes of methods: each runs one, draws what it made, and writes figures as JSON and arrays as files."""
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
+import signal
 import sys
 from pathlib import Path
 from time import perf_counter
@@ -15,12 +17,16 @@ from clrecon.opencl import has_hung_commands
 from clrecon.operators import choose_device
 from clrecon.proof.compare.makers import Scene, draw, make_timed, time_small
 from clrecon.proof.compare.methods import COMPARED
-from clrecon.proof.compare.processes import Request, load_volume, save_arrays, save_mesh
+from clrecon.proof.compare.processes import COPIES, Request, load_volume, save_arrays, save_mesh, tell_crash
 from clrecon.system.processes import end_process
 from clrecon.system.progress import time_limit
 
 LONG_SECONDS = 1.0
 """No further warm run begins after so many seconds of them."""
+
+
+_END_WITH_PARENT = 1
+"""PR_SET_PDEATHSIG of Linux."""
 
 
 def run_method(request: Request) -> dict[str, Any]:
@@ -113,14 +119,24 @@ def _open_device(scene: Scene) -> float:
 
 
 def main() -> None:
-    """Run the method that the JSON object on stdin names, and write what comes of it to stdout as JSON."""
-    lines = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    """Run the methods that lines of JSON on stdin name, and answer each with a line of JSON on stdout.
+
+    Each runs in a copy of this process, which has loaded the modules already, or one alone where there are no copies.
+    """
+    lines = os.fdopen(os.dup(1), "w", encoding="utf-8", buffering=1)
     os.dup2(2, 1)  # a driver may print
-    data = json.load(sys.stdin)
-    request = Request(**{**data, "size": tuple(data["size"])})
-    lines.write(to_json(run_method(request), indent=None) + "\n")
-    lines.flush()
-    end_process()
+    for line in sys.stdin:
+        if COPIES and (copy := os.fork()):
+            code = os.waitstatus_to_exitcode(os.waitpid(copy, 0)[1])
+            if code:
+                lines.write(to_json(tell_crash(code), indent=None) + "\n")
+            continue
+        if COPIES:
+            ctypes.CDLL(None).prctl(_END_WITH_PARENT, signal.SIGKILL)
+        data = json.loads(line)
+        request = Request(**{**data, "size": tuple(data["size"])})
+        lines.write(to_json(run_method(request), indent=None) + "\n")
+        end_process()
 
 
 if __name__ == "__main__":

@@ -33,7 +33,7 @@ from clrecon.proof.compare.figures import (
 from clrecon.proof.compare.findings import CompareReport
 from clrecon.proof.compare.methods import COMPARED, Compared, CompareSettings, choose_methods
 from clrecon.proof.compare.page import make_page
-from clrecon.proof.compare.processes import Request, measure_in_processes, run_in_process, save_volume
+from clrecon.proof.compare.processes import Request, measure_in_processes, open_methods, save_volume
 from clrecon.proof.compare.records import Given, compose_report, make_record
 from clrecon.proof.phantom import phantom_truth
 from clrecon.reading import read_selected
@@ -202,18 +202,19 @@ def _run_methods(
     along = along_slices(volume) if settings.paper else None
     rows: dict[str, dict[str, Any]] = {}
     hung = False
-    for done, method in enumerate(methods):
-        progress("compare methods", done, len(methods))
-        if hung and method.on_device:
-            rows[method.name] = {"state": "failed", "kind": "DeviceError", "error": "not run: the device hangs"}
-            continue
-        request = Request(
-            method=method.name, folder=str(figures.work), iso_value=figures.level, closed=settings.closed,
-            device=device.index, memory=settings.memory, repeat=settings.repeat, timeout=device_seconds(),
-            camera=camera, size=SIZE, along=along,
-        )  # fmt: skip
-        rows[method.name] = run_in_process(request)
-        hung = hung or bool(rows[method.name].get("hung"))
+    with open_methods() as run:
+        for done, method in enumerate(methods):
+            progress("compare methods", done, len(methods))
+            if hung and method.on_device:
+                rows[method.name] = {"state": "failed", "kind": "DeviceError", "error": "not run: the device hangs"}
+                continue
+            request = Request(
+                method=method.name, folder=str(figures.work), iso_value=figures.level, closed=settings.closed,
+                device=device.index, memory=settings.memory, repeat=settings.repeat, timeout=device_seconds(),
+                camera=camera, size=SIZE, along=along,
+            )  # fmt: skip
+            rows[method.name] = run(request)
+            hung = hung or bool(rows[method.name].get("hung"))
     progress("compare methods", len(methods), len(methods))
     _refuse_nothing(rows)
     return rows
@@ -233,18 +234,17 @@ def _refuse_nothing(rows: dict[str, dict[str, Any]]) -> None:
 def _measure_methods(
     rows: dict[str, dict[str, Any]], figures: Figures, settings: CompareSettings, truth: str | None, progress: Progress
 ) -> dict[str, dict[str, Any]]:
-    done = {name: each for name, each in rows.items() if each["state"] == "done"}
-    sizes = {name: size for name, each in done.items() if (size := int(each["triangles"] or each["points"] or 0))}
+    done = [name for name, each in rows.items() if each["state"] == "done" and (each["triangles"] or each["points"])]
     asked = {
         "folder": str(figures.work),
-        "reference": settings.reference if settings.reference in sizes else None,
+        "reference": settings.reference if settings.reference in done else None,
         "iso_value": figures.level,
         "closed": settings.closed,
         "truth": truth,
     }
     measured: dict[str, dict[str, Any]] = {}
-    progress("measure methods", 0, len(sizes))
-    for name, measures in measure_in_processes(asked, sizes):
+    progress("measure methods", 0, len(done))
+    for name, measures in measure_in_processes(asked, done):
         measured[name] = measures
-        progress("measure methods", len(measured), len(sizes))
+        progress("measure methods", len(measured), len(done))
     return measured

@@ -4,11 +4,13 @@ They are told and tell plain values, and arrays in files of a folder; a crash of
 
 from __future__ import annotations
 
+import contextlib
 import json
 import queue
 import subprocess
+import sys
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -20,7 +22,7 @@ from clrecon.geometry import Volume
 from clrecon.mesh import Mesh
 from clrecon.proof.timing import usable_cores
 from clrecon.rendering.views.camera import Camera
-from clrecon.system.processes import describe_end, start_with
+from clrecon.system.processes import describe_end, start_python, start_with
 
 _VOXELS, _PLACE = "voxels.npy", "place.npz"
 
@@ -100,32 +102,73 @@ _SUBJECT = "methods are compared"
 _MOST_JUDGES = 4
 
 
-def run_in_process(request: Request) -> dict[str, Any]:
-    """Run a method in a process of its own, and return what `clrecon.proof.compare.child.run_method` tells."""
-    process = start_with(_METHOD, _SUBJECT, request.as_dict())
-    assert process.stdout is not None
+COPIES = sys.platform == "linux"
+"""Whether a process can go on as a copy; elsewhere the system's libraries may not work in one, or there are none."""
+
+
+def tell_crash(code: int) -> dict[str, Any]:
+    """Return what a process would have told that ended with an exit code instead."""
+    return {"state": "failed", "kind": "Crash", "error": describe_end(code), "hung": False}
+
+
+@contextlib.contextmanager
+def open_methods() -> Iterator[Callable[[Request], dict[str, Any]]]:
+    """Yield a function that runs a method in a process of its own: see `clrecon.proof.compare.child.run_method`."""
+    running: list[subprocess.Popen[bytes]] = []
+
+    def end() -> int:
+        process = running.pop()
+        with process:
+            assert process.stdin is not None
+            with contextlib.suppress(OSError):
+                process.stdin.close()
+        return process.returncode
+
+    def run(request: Request) -> dict[str, Any]:
+        if not running:
+            running.append(start_python(_METHOD, _SUBJECT))
+        asked, answers = running[0].stdin, running[0].stdout
+        assert asked is not None and answers is not None
+        with contextlib.suppress(OSError):  # it has ended already: its answer is missing
+            asked.write(json.dumps(request.as_dict()).encode() + b"\n")
+            asked.flush()
+        answer = answers.readline()
+        code = 0 if answer and COPIES else end()
+        return json.loads(answer) if answer else tell_crash(code)
+
     try:
-        answer = process.stdout.read()
-        process.wait()
+        yield run
     finally:
-        process.kill()
-        process.wait()
-        process.stdout.close()
-    try:
-        answer_record: dict[str, Any] = json.loads(answer)
-    except ValueError:
-        return {"state": "failed", "kind": "Crash", "error": describe_end(process.returncode), "hung": False}
-    return answer_record
+        for process in running:
+            process.kill()
+        if running:
+            end()
 
 
-def measure_in_processes(data: Mapping[str, Any], methods: Mapping[str, int]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Measure products, a process a core; yield names with figures, see `Judge`, or ``reasons``."""
-    parts = _share(methods, min(usable_cores(), _MOST_JUDGES))
+MEASURES = {"quality": 2, "slices": 4, "cells": 4, "surfaces": 6, "truth": 3, "points": 1}
+"""What is measured, and about how long each takes beside the others."""
+
+
+def measure_in_processes(data: Mapping[str, Any], methods: Sequence[str]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Measure products, a process a core; yield names with figures, see `Judge`, and ``reasons``.
+
+    Each process takes some measures of all products, so that what it needs of scan and reference is made once.
+    """
+    parts = _share(MEASURES, min(usable_cores(), _MOST_JUDGES))
     lines: queue.Queue[tuple[int, bytes]] = queue.Queue()
     processes: list[subprocess.Popen[bytes]] = []
+    told: dict[str, dict[int, dict[str, Any]]] = {name: {} for name in methods}
+
+    def note(number: int, method: str, figures: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+        told[method][number] = figures
+        if len(told[method]) == len(parts):
+            parts_in_order = [told[method][number] for number in range(len(parts))]
+            reasons = {name: why for each in parts_in_order for name, why in each.pop("reasons").items()}
+            yield method, {name: own for each in parts_in_order for name, own in each.items()} | {"reasons": reasons}
+
     try:
         for number, part in enumerate(parts):
-            process = start_with(_JUDGE, _SUBJECT, {**data, "methods": part})
+            process = start_with(_JUDGE, _SUBJECT, {**data, "methods": list(methods), "measures": part})
             processes.append(process)
             threading.Thread(target=_forward, args=(number, process.stdout, lines), daemon=True).start()
         running = len(processes)
@@ -133,13 +176,13 @@ def measure_in_processes(data: Mapping[str, Any], methods: Mapping[str, int]) ->
             number, line = lines.get()
             if line:
                 figures = json.loads(line)
-                parts[number].remove(figures["method"])
-                yield figures.pop("method"), figures
+                yield from note(number, figures.pop("method"), figures)
                 continue
             running -= 1
             processes[number].wait()
-            for name in parts[number]:
-                yield name, {"reasons": {"all": describe_end(processes[number].returncode)}}
+            for name in methods:
+                if number not in told[name]:
+                    yield from note(number, name, {"reasons": {"all": describe_end(processes[number].returncode)}})
     finally:
         for process in processes:
             process.kill()
@@ -155,12 +198,9 @@ def _forward(number: int, stream: IO[bytes] | None, lines: queue.Queue[tuple[int
     lines.put((number, b""))
 
 
-def _share(methods: Mapping[str, int], most: int) -> list[list[str]]:
-    """Share methods out to at most so many processes, the largest first, each to the one with the least to do."""
-    parts: list[list[str]] = [[] for _ in range(max(1, min(most, len(methods))))]
-    loads = [0] * len(parts)
-    for name, load in sorted(methods.items(), key=lambda each: -each[1]):
-        least = loads.index(min(loads))
-        parts[least].append(name)
-        loads[least] += load + 1
+def _share(loads: Mapping[str, int], most: int) -> list[list[str]]:
+    """Share out to at most so many processes, the largest first, each to the one with the least to do."""
+    parts: list[list[str]] = [[] for _ in range(min(most, len(loads)))]
+    for name in sorted(loads, key=lambda name: -loads[name]):
+        min(parts, key=lambda part: sum(loads[each] for each in part)).append(name)
     return parts

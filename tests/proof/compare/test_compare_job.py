@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -27,7 +28,7 @@ from clrecon.proof.compare.findings import CompareReport, MethodRecord
 from clrecon.proof.compare.job import make_comparison
 from clrecon.proof.compare.judge import Judge
 from clrecon.proof.compare.methods import COMPARED, CompareSettings
-from clrecon.proof.compare.processes import Request
+from clrecon.proof.compare.processes import MEASURES, Request
 from clrecon.proof.compare.table import COLUMNS
 from clrecon.proof.phantom import PhantomSettings, write_phantom
 
@@ -38,16 +39,17 @@ OF_TIME = re.compile(r"_s$|_ms$|seconds|_bytes$|^date$|free_cores|findings|warni
 """Entries of times, memory and the machine's load; findings and warnings tell of these too."""
 NOBODY_TELLS = "import os; os.abort()"
 ONE_CRASHES = """
-import io, json, os, sys
-told = sys.stdin.read()
-method = json.loads(told)["method"]
-if method == "skimage":
-    os.abort()
-if method == "vtk-mc":
-    sys.modules["vtkmodules"] = None
-sys.stdin = io.StringIO(told)
-from clrecon.proof.compare.child import main
-main()
+import os, sys
+from clrecon.proof.compare import child
+run_method = child.run_method
+def fail(request):
+    if request.method == "skimage":
+        os.abort()
+    if request.method == "vtk-mc":
+        sys.modules["vtkmodules"] = None
+    return run_method(request)
+child.run_method = fail
+child.main()
 """
 
 
@@ -95,11 +97,11 @@ def leave_processes_out(monkeypatch: pytest.MonkeyPatch) -> None:
     def run_method(request: Request) -> dict[str, Any]:
         return json.loads(to_json(child.run_method(request)))
 
-    def measure(told: Mapping[str, Any], methods: Mapping[str, int]) -> Iterator[tuple[str, dict[str, Any]]]:
-        judge = Judge(told)
+    def measure(told: Mapping[str, Any], methods: Sequence[str]) -> Iterator[tuple[str, dict[str, Any]]]:
+        judge = Judge({**told, "measures": list(MEASURES)})
         yield from ((name, json.loads(to_json(judge.measure(name)))) for name in methods)
 
-    monkeypatch.setattr(job, "run_in_process", run_method)
+    monkeypatch.setattr(job, "open_methods", lambda: nullcontext(run_method))
     monkeypatch.setattr(job, "measure_in_processes", measure)
 
 

@@ -39,7 +39,7 @@ from clrecon.proof.compare.findings import (
 from clrecon.proof.compare.judge import Judge
 from clrecon.proof.compare.makers import extract_by_vtk
 from clrecon.proof.compare.methods import COMPARED, choose_methods
-from clrecon.proof.compare.processes import Request, load_mesh, load_volume, save_mesh, save_volume
+from clrecon.proof.compare.processes import MEASURES, Request, load_mesh, load_volume, save_mesh, save_volume
 from clrecon.proof.compare.records import make_record
 from clrecon.system.text import list_names
 
@@ -174,7 +174,8 @@ def judge(tmp_path: Path, device: Any) -> Judge:
     save_mesh(tmp_path, "t-mc", mesh)
     save_mesh(tmp_path, "vtk-mc", Mesh(mesh.vertices, mesh.triangles[: mesh.triangle_count // 2]))
     np.save(tmp_path / "cloud-points.npy", mesh.vertices + np.float32([0.0, 0.0, 50.0]))
-    return Judge({"folder": tmp_path, "reference": "t-mc", "iso_value": 200, "closed": True, "truth": None})
+    message = {"reference": "t-mc", "iso_value": 200, "closed": True, "truth": None, "measures": list(MEASURES)}
+    return Judge({"folder": tmp_path, **message})
 
 
 def test_reference_is_measured_as_equal_to_itself(judge: Judge) -> None:
