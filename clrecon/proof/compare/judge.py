@@ -117,7 +117,7 @@ def main() -> None:
     data = json.load(sys.stdin)
     judge = Judge(data)
     for method in data["methods"]:
-        lines.write(to_json({"method": method, **judge.measure(method)}, indent=None) + "\n")
+        lines.write(to_json(judge.measure(method), indent=None) + "\n")
 
 
 if __name__ == "__main__":

@@ -223,49 +223,50 @@ def _check_place(ijk: NDArray[np.float64], grid: Grid) -> None:
 
 def _cells_of(triangles: Triangles, margin: float) -> Iterator[IntArray]:
     """Yield cells of triangles, shape (n, 3), some of them several times."""
+    # by columns, shape (corner, axis, n): numpy takes the least along a short axis slowly
+    columns = np.ascontiguousarray(triangles.transpose(1, 2, 0))
     # triangles in a plane between cells count for the upper cells
-    plane = np.rint(triangles[:, :1])
-    flat = (np.abs(triangles - plane) <= margin).all(axis=1, keepdims=True)
-    corners = lifted = np.where(flat, plane + 0.5, triangles)
-    owner = np.arange(len(corners))
-    reached = np.zeros(len(corners), dtype=bool)
-    while len(corners):
-        low = np.ceil(corners.min(axis=1) - 1.0 + margin).astype(np.int64)
-        size = np.maximum(np.floor(corners.max(axis=1) - margin).astype(np.int64) - low + 1, 0)
-        count = size.prod(axis=1)
-        is_single = count == 1
-        reached[owner[is_single]] = True
-        yield low[is_single]
+    plane = np.rint(columns[0])
+    flat = (np.abs(columns - plane) <= margin).all(axis=0)
+    corners = lifted = np.where(flat, plane + 0.5, columns)
+    owner = np.arange(len(triangles))
+    reached = np.zeros(len(triangles), dtype=bool)
+    while len(owner):
+        low = np.ceil(corners.min(axis=0) - 1.0 + margin).astype(np.int64)
+        size = np.maximum(np.floor(corners.max(axis=0) - margin).astype(np.int64) - low + 1, 0)
+        count = size.prod(axis=0)
+        single = np.flatnonzero(count == 1)
+        reached[owner[single]] = True
+        yield low.take(single, axis=1).T
         several = np.flatnonzero((count > 1) & (count <= _MOST_CANDIDATES))
         for cells, row in _tested(corners, low, size, several, margin):
             reached[owner[row]] = True
             yield cells
         many = count > _MOST_CANDIDATES
         # four triangles between corners and middles of edges of each
-        a, b, c = (corners[many][:, corner] for corner in range(3))
+        a, b, c = corners[:, :, many]
         ab, bc = 0.5 * (a + b), 0.5 * (b + c)
         ca = 0.5 * (c + a)
-        parts = [np.stack(part, axis=1) for part in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
-        corners, owner = np.stack(parts, axis=1).reshape(-1, 3, 3), np.repeat(owner[many], 4)
+        parts = [np.stack(part) for part in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
+        corners, owner = np.concatenate(parts, axis=2), np.tile(owner[many], 4)
     # Slivers along an edge between cells reach farther into none of them than coordinates are rounded.
-    yield np.floor(lifted[~reached].mean(axis=1)).astype(np.int64)
+    yield np.floor(lifted[:, :, ~reached].mean(axis=0)).astype(np.int64).T
 
 
 def _tested(
     corners: Triangles, low: IntArray, size: IntArray, rows: IntArray, margin: float
 ) -> Iterator[tuple[IntArray, IntArray]]:
-    """Yield the cells of some rows that pass the test, and their rows."""
-    step = _PIECE // _MOST_CANDIDATES * 4
-    for start in range(0, len(rows), step):
-        part = rows[start : start + step]
-        extent = size[part]
-        count = extent.prod(axis=1)
-        pair = np.repeat(np.arange(len(part)), count)
+    """Yield the cells of some rows that pass the test, and their rows; all by columns."""
+    for piece in chunks(len(rows), _PIECE // _MOST_CANDIDATES * 4):
+        part = rows[piece]
+        count = size.take(part, axis=1).prod(axis=0)
+        pair = part.repeat(count)
         rank = np.arange(len(pair)) - np.repeat(np.cumsum(count) - count, count)
-        ni, nj = extent[pair, 0], extent[pair, 1]
-        cells = low[part][pair] + np.stack([rank % ni, rank // ni % nj, rank // (ni * nj)], axis=1)
-        meets = meets_box(corners[part[pair]] - (cells + 0.5)[:, None], 0.5 - margin)
-        yield cells[meets], part[pair[meets]]
+        ni, nj, _ = size.take(pair, axis=1)
+        cells = low.take(pair, axis=1) + np.stack([rank % ni, rank // ni % nj, rank // (ni * nj)])
+        near = corners.take(pair, axis=2) - (cells + 0.5)
+        meets = np.flatnonzero(meets_box(near.transpose(2, 0, 1), 0.5 - margin))
+        yield cells.take(meets, axis=1).T, pair[meets]
 
 
 @explains_arguments

@@ -193,7 +193,7 @@ class _Counts:
         return 2.0 * self.common / both if both else 0.0
 
 
-_PIECE = 1 << 16
+_PIECE = 1 << 14
 """Triangles at a time."""
 
 Float64Array = NDArray[np.float64]
@@ -213,9 +213,9 @@ def find_piercings(ijk: Float64Array, triangles: NDArray[np.uint32], lattice: La
     Returns: ndarray, shape (p,), int64, ascending. Ends of runs of points inside, see the head of this file;
         those that would be there an even number of times are not.
     """
-    points = lattice.number(ijk)
+    points = np.ascontiguousarray(lattice.number(ijk).T)
     piercings = [np.zeros(0, dtype=np.int64)]
-    piercings += [_pierce(points[triangles[where]], lattice.shape_ijk) for where in chunks(len(triangles), _PIECE)]
+    piercings += [_pierce(points, triangles[where], lattice.shape_ijk) for where in chunks(len(triangles), _PIECE)]
     keys = np.sort(np.concatenate(piercings))
     fresh = np.flatnonzero(np.diff(keys, prepend=-1))
     return keys[fresh[np.diff(fresh, append=len(keys)) % 2 == 1]]
@@ -228,22 +228,30 @@ def _spread_rows(first: IntArray, end: IntArray) -> tuple[IntArray, IntArray]:
     return row, np.arange(len(row)) + (first - np.cumsum(count) + count)[row]
 
 
-def _pierce(corners: Float64Array, shape_ijk: tuple[int, int, int]) -> IntArray:
-    """Return the numbers of `find_piercings` for triangles, shape (m, 3, 3)."""
+def _pierce(points: Float64Array, triangles: NDArray[np.uint32], shape_ijk: tuple[int, int, int]) -> IntArray:
+    """Return the numbers of `find_piercings` for triangles, shape (m, 3), between points, shape (3, n)."""
     ni, nj, nk = shape_ijk
-    order = np.argsort(corners[:, :, 2], axis=1, kind="stable")
-    a, b, c = (corners[np.arange(len(corners)), order[:, n]] for n in range(3))
-    row, plane = _spread_rows(*(_first_from(end[:, 2], nk) for end in (a, c)))
-    a, b = a[row], b[row]
-    c = c[row]
-    upper = (plane >= b[:, 2])[:, None]
-    first = _points_at(a, c, plane, 2)
-    second = _points_at(np.where(upper, b, a), np.where(upper, c, b), plane, 2)
-    swapped = (first[:, 1] > second[:, 1])[:, None]
+    heights = points[2]
+    a, b, c = triangles.T.astype(np.intp)
+    a, b = _put_in_order(a, b, heights)
+    b, c = _put_in_order(b, c, heights)
+    a, b = _put_in_order(a, b, heights)
+    row, plane = _spread_rows(_first_from(heights[a], nk), _first_from(heights[c], nk))
+    a, b, c = (point[row] for point in (a, b, c))
+    upper = plane >= heights[b]
+    first = _points_at(points[:, a], points[:, c], plane)
+    second = _points_at(points[:, np.where(upper, b, a)], points[:, np.where(upper, c, b)], plane)
+    swapped = first[1] > second[1]
     first, second = np.where(swapped, second, first), np.where(swapped, first, second)
-    line, at_row = _spread_rows(*(_first_from(end[:, 1], nj) for end in (first, second)))
-    i = _first_from(_points_at(first[line], second[line], at_row, 1)[:, 0], ni)
+    line, at_row = _spread_rows(_first_from(first[1], nj), _first_from(second[1], nj))
+    i = _first_from(_points_at(first[:, line], second[:, line], at_row)[0], ni)
     return np.asarray((plane[line] * nj + at_row) * (ni + 1) + i)
+
+
+def _put_in_order(first: IntArray, second: IntArray, heights: Float64Array) -> tuple[IntArray, IntArray]:
+    """Return points with those first that are not higher."""
+    swapped = heights[first] > heights[second]
+    return np.where(swapped, second, first), np.where(swapped, first, second)
 
 
 def _first_from(values: Float64Array, size: int) -> IntArray:
@@ -251,10 +259,10 @@ def _first_from(values: Float64Array, size: int) -> IntArray:
     return np.clip(np.ceil(values), 0, size).astype(np.int64)
 
 
-def _points_at(low: Float64Array, high: Float64Array, coordinate: IntArray, axis: int) -> Float64Array:
-    """Return the points of lines from `low` to `high` at a coordinate along an axis; its two other coordinates."""
-    share = (coordinate - low[:, axis]) / (high[:, axis] - low[:, axis])
-    return low[:, :axis] + share[:, None] * (high[:, :axis] - low[:, :axis])
+def _points_at(low: Float64Array, high: Float64Array, coordinate: IntArray) -> Float64Array:
+    """Return the points of lines from `low` to `high`, by columns, at a last coordinate; the coordinates before it."""
+    share = (coordinate - low[-1]) / (high[-1] - low[-1])
+    return low[:-1] + share * (high[:-1] - low[:-1])
 
 
 _SLAB_VOXELS = 1 << 23

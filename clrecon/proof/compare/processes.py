@@ -6,14 +6,12 @@ from __future__ import annotations
 
 import contextlib
 import json
-import queue
 import subprocess
 import sys
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,7 +99,6 @@ _SUBJECT = "methods are compared"
 
 _MOST_JUDGES = 4
 
-
 COPIES = sys.platform == "linux"
 """Whether a process can go on as a copy; elsewhere the system's libraries may not work in one, or there are none."""
 
@@ -116,33 +113,26 @@ def open_methods() -> Iterator[Callable[[Request], dict[str, Any]]]:
     """Yield a function that runs a method in a process of its own: see `clrecon.proof.compare.child.run_method`."""
     running: list[subprocess.Popen[bytes]] = []
 
-    def end() -> int:
-        process = running.pop()
-        with process:
-            assert process.stdin is not None
-            with contextlib.suppress(OSError):
-                process.stdin.close()
-        return process.returncode
-
     def run(request: Request) -> dict[str, Any]:
         if not running:
             running.append(start_python(_METHOD, _SUBJECT))
-        asked, answers = running[0].stdin, running[0].stdout
-        assert asked is not None and answers is not None
+        (process,) = running
+        assert process.stdin is not None and process.stdout is not None
         with contextlib.suppress(OSError):  # it has ended already: its answer is missing
-            asked.write(json.dumps(request.as_dict()).encode() + b"\n")
-            asked.flush()
-        answer = answers.readline()
-        code = 0 if answer and COPIES else end()
-        return json.loads(answer) if answer else tell_crash(code)
+            process.stdin.write(json.dumps(request.as_dict()).encode() + b"\n")
+            process.stdin.flush()
+        answer = process.stdout.readline()
+        if not answer or not COPIES:
+            running.remove(process)
+            process.communicate()
+        return json.loads(answer) if answer else tell_crash(process.returncode)
 
     try:
         yield run
     finally:
         for process in running:
             process.kill()
-        if running:
-            end()
+            process.communicate()
 
 
 MEASURES = {"quality": 2, "slices": 4, "cells": 4, "surfaces": 6, "truth": 3, "points": 1}
@@ -155,52 +145,27 @@ def measure_in_processes(data: Mapping[str, Any], methods: Sequence[str]) -> Ite
     Each process takes some measures of all products, so that what it needs of scan and reference is made once.
     """
     parts = _share(MEASURES, min(usable_cores(), _MOST_JUDGES))
-    lines: queue.Queue[tuple[int, bytes]] = queue.Queue()
     processes: list[subprocess.Popen[bytes]] = []
-    told: dict[str, dict[int, dict[str, Any]]] = {name: {} for name in methods}
-
-    def note(number: int, method: str, figures: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
-        told[method][number] = figures
-        if len(told[method]) == len(parts):
-            parts_in_order = [told[method][number] for number in range(len(parts))]
-            reasons = {name: why for each in parts_in_order for name, why in each.pop("reasons").items()}
-            yield method, {name: own for each in parts_in_order for name, own in each.items()} | {"reasons": reasons}
-
     try:
-        for number, part in enumerate(parts):
-            process = start_with(_JUDGE, _SUBJECT, {**data, "methods": list(methods), "measures": part})
-            processes.append(process)
-            threading.Thread(target=_forward, args=(number, process.stdout, lines), daemon=True).start()
-        running = len(processes)
-        while running:
-            number, line = lines.get()
-            if line:
-                figures = json.loads(line)
-                yield from note(number, figures.pop("method"), figures)
-                continue
-            running -= 1
-            processes[number].wait()
-            for name in methods:
-                if number not in told[name]:
-                    yield from note(number, name, {"reasons": {"all": describe_end(processes[number].returncode)}})
+        for part in parts:
+            processes.append(start_with(_JUDGE, _SUBJECT, {**data, "methods": list(methods), "measures": part}))
+        for method in methods:
+            figures: dict[str, Any] = {"reasons": {}}
+            for process in processes:
+                assert process.stdout is not None
+                line = process.stdout.readline()
+                answer = json.loads(line) if line else {"reasons": {"all": describe_end(process.wait())}}
+                figures |= {**answer, "reasons": figures["reasons"] | answer["reasons"]}
+            yield method, figures
     finally:
         for process in processes:
-            process.kill()
-            process.wait()
-
-
-def _forward(number: int, stream: IO[bytes] | None, lines: queue.Queue[tuple[int, bytes]]) -> None:
-    """Put the lines of a process into a queue, and an empty one at its end."""
-    assert stream is not None
-    with stream:
-        for line in stream:
-            lines.put((number, line))
-    lines.put((number, b""))
+            with process:
+                process.kill()
 
 
 def _share(loads: Mapping[str, int], most: int) -> list[list[str]]:
     """Share out to at most so many processes, the largest first, each to the one with the least to do."""
     parts: list[list[str]] = [[] for _ in range(min(most, len(loads)))]
     for name in sorted(loads, key=lambda name: -loads[name]):
-        min(parts, key=lambda part: sum(loads[each] for each in part)).append(name)
+        min(parts, key=lambda part: sum(map(loads.__getitem__, part))).append(name)
     return parts
