@@ -93,7 +93,8 @@ def measure_meshes(
             meshes = side_by_side(partial(read_side, reference, settings.mesh_space), read_own)[::-1]
         else:
             meshes = side_by_side(read_own, partial(_make_side, run, reference, device))
-        surveys = side_by_side(*(partial(survey_surface, own.vertices, own.triangles) for own in meshes))
+        survey_side = partial(survey_surface, by_triangle=True)
+        surveys = side_by_side(*(partial(survey_side, own.vertices, own.triangles) for own in meshes))
         entries = [
             describe_mesh(own, path, survey[0])
             for own, path, survey in zip(meshes, (mesh, reference), surveys, strict=True)

@@ -55,13 +55,26 @@ class TriangleTree:
         self._triangles = triangles
         # Rounded outwards: no triangle is left out for the digits of its box.
         lows, highs = np.empty((2, 3, len(triangles)), np.float32)
-        for axis, column in enumerate(self._columns):
-            a, b, c = (column.take(corner, mode="clip") for corner in triangles.T)
-            np.nextafter(np.minimum(np.minimum(a, b), c), -np.inf, out=lows[axis], dtype=np.float32)
-            np.nextafter(np.maximum(np.maximum(a, b), c), np.inf, out=highs[axis], dtype=np.float32)
+        middles = np.empty_like(lows)  # twice as far from zero
+
+        def bound_piece(piece: slice) -> None:
+            corners = triangles[piece].T.astype(np.intp)
+            for axis, column in enumerate(self._columns):
+                a, b, c = column.take(corners, mode="clip")
+                low, high = lows[axis, piece], highs[axis, piece]
+                np.nextafter(np.minimum(np.minimum(a, b), c), -np.inf, out=low, dtype=np.float32)
+                np.nextafter(np.maximum(np.maximum(a, b), c), np.inf, out=high, dtype=np.float32)
+                np.add(low, high, out=middles[axis, piece])
+
+        in_threads(bound_piece, len(triangles))
         self._slack = 2.0 * float(np.spacing(np.abs(lows).max() + np.abs(highs).max()))
-        self._curve = Curve(lows + highs)
-        codes = self._curve.codes(lows + highs)
+        self._curve = Curve(middles)
+        codes = np.empty(len(triangles), np.uint32)
+
+        def place_piece(piece: slice) -> None:
+            codes[piece] = self._curve.codes(middles[:, piece])
+
+        in_threads(place_piece, len(triangles))
         order = np.argsort(codes, kind="stable")  # mostly in order already
         order = np.concatenate([order, np.full(-len(order) % _LEAF, order[-1])])
         self._rows, self._firsts = order.reshape(-1, _LEAF), codes[order[::_LEAF]]

@@ -28,16 +28,26 @@ _STEPS_U, _STEPS_V = 0.7548776662466927, 0.5698402909980532
 Points = NDArray[np.float64]
 
 
-def sample_surface(vertices: NDArray[np.floating], triangles: NDArray[np.uint32], count: int = SAMPLES) -> Points:
+def sample_surface(
+    vertices: NDArray[np.floating],
+    triangles: NDArray[np.uint32],
+    count: int = SAMPLES,
+    twice_areas: NDArray[np.float64] | None = None,
+) -> Points:
     """Return points that cover a surface evenly by area, the same at every call: shape (count, 3), float64, mm."""
-    return sample_surface_points(vertices, triangles, count)[0]
+    return sample_surface_points(vertices, triangles, count, twice_areas)[0]
 
 
 def sample_surface_points(
-    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], count: int = SAMPLES
+    vertices: NDArray[np.floating],
+    triangles: NDArray[np.uint32],
+    count: int = SAMPLES,
+    twice_areas: NDArray[np.float64] | None = None,
 ) -> tuple[Points, NDArray[np.int64]]:
     """As `sample_surface`, with the row of the triangle of each point, shape (count,)."""
-    up_to = np.cumsum(measure_triangles(vertices, triangles, by_triangle=True).twice_areas)
+    if twice_areas is None:
+        twice_areas = measure_triangles(vertices, triangles, by_triangle=True).twice_areas
+    up_to = np.cumsum(twice_areas)
     if len(up_to) == 0 or up_to[-1] <= 0.0:
         raise NoSurfaceError("a surface without area has no points to measure from")
     number = np.arange(count, dtype=np.float64)

@@ -127,20 +127,21 @@ class Ruler:
     distances_of: SignedDistance | SurfaceDistance
     signed: bool
     warnings: list[str]
+    twice_areas: NDArray[np.float64]
 
     @classmethod
     def of(cls, mesh: Mesh, name: str, survey: tuple[MeshQuality, Topology, TriangleSums] | None = None) -> Ruler:
-        """Make the ruler of a mesh that warnings call `name`; `survey`: that of `survey_surface`, if it is known."""
+        """Make the ruler of a mesh that warnings call `name`; `survey`: that by triangle, if it is known."""
         mesh.check()
         if not mesh.triangle_count:
             raise NoSurfaceError(f"{name} has no triangles: there is nothing to measure from")
-        quality, topology, _ = survey or survey_surface(mesh.vertices, mesh.triangles)
+        quality, topology, sums = survey or survey_surface(mesh.vertices, mesh.triangles, by_triangle=True)
         why = why_unsigned(quality, name)
         if why is not None:
-            return cls(SurfaceDistance(mesh.vertices, mesh.triangles), False, [why])
+            return cls(SurfaceDistance(mesh.vertices, mesh.triangles), False, [why], sums.twice_areas)
         inverted = f"{name} is turned inside out: the sign of distances from it is turned back"
         signed = SignedDistance(mesh.vertices, mesh.triangles, outward=quality.outward, opposite=topology.opposite)
-        return cls(signed, True, [] if quality.outward else [inverted])
+        return cls(signed, True, [] if quality.outward else [inverted], sums.twice_areas)
 
     def measure(
         self, points: NDArray[np.floating], progress: Progress | None, side: tuple[int, int] = (0, 1)
@@ -252,7 +253,7 @@ def compare_sides(
     """Measure two meshes as `measure_distance` does, points of each with the ruler of the other."""
     sides, signed = [], []
     for number, (source, ruler) in enumerate(zip(meshes, rulers, strict=True)):
-        points = sample_surface(source.vertices, source.triangles, samples)
+        points = sample_surface(source.vertices, source.triangles, samples, rulers[1 - number].twice_areas)
         distances = ruler.measure(points, progress, (number, 2))
         sides.append(summarise_distances(np.abs(distances)))
         signed.append(_summarise_sides(distances) if ruler.signed else None)
