@@ -224,7 +224,7 @@ def find_edges(triangles: NDArray[np.uint32], vertex_count: int) -> Edges:
     end = triangles[:, (1, 2, 0)].reshape(-1)
     keys = np.minimum(start, end).astype(np.uint64)
     keys <<= np.uint64(32)
-    keys |= np.maximum(start, end)
+    keys |= np.maximum(start, end).astype(np.uint64)
     keys <<= np.uint64(1)
     keys |= start > end
     is_loop = start == end
