@@ -113,26 +113,23 @@ def _index_type(size: int) -> type[np.integer]:
     return np.int32 if size < 2**31 else np.int64
 
 
-def order_by_number(numbers: IntArray, size: int) -> IntArray:
-    """Return the stable order of whole numbers from 0 to ``size - 1``, like ``argsort(kind="stable")``.
+def order_by_number(numbers: IntArray) -> IntArray:
+    """Return the stable order of up to 2^32 whole numbers from 0 to 2^32 - 1, like ``argsort(kind="stable")``.
 
-    Numbers of 16 bits are sorted by counting: the upper bits first, then the lower within each value of the upper.
+    They are sorted together with their places, as numbers of 64 bits: numpy does that with vectors.
     """
-    count = len(numbers)
-    if size > min(8 * count + 1024, 1 << 32):  # counting would waste time on numbers that do not occur
-        return np.argsort(numbers, kind="stable")
-    lower, upper = numbers.astype(np.uint16), (numbers >> 16).astype(np.uint16)
-    if size <= 1 << 16:
-        return np.argsort(lower, kind="stable").astype(_index_type(count))
-    order = np.argsort(upper, kind="stable").astype(_index_type(count))
-    ends = np.cumsum(np.bincount(upper))
+    packed = pack_numbers(numbers, np.arange(len(numbers), dtype=np.uint32))
+    packed.sort()
+    packed &= np.uint64(0xFFFFFFFF)
+    return packed.astype(_index_type(len(numbers)))
 
-    def sort_lower(values: slice) -> None:
-        span = slice(ends[values.start - 1] if values.start else 0, ends[values.start])
-        order[span] = order[span].take(np.argsort(lower.take(order[span]), kind="stable"))
 
-    in_threads(sort_lower, len(ends), 1)
-    return order
+def pack_numbers(upper: IntArray, lower: NDArray[np.uint32]) -> NDArray[np.uint64]:
+    """Return numbers of 64 bits of which the upper half, from 0 to 2^32 - 1, counts first where they are sorted."""
+    packed = upper.astype(np.uint64)
+    packed <<= np.uint64(32)
+    packed |= lower
+    return packed
 
 
 def find_used(numbers: IntArray, size: int) -> IntArray:
@@ -163,7 +160,7 @@ class Lists:
     """Rows by number: of number v `rows` from ``begin[v]`` to ``begin[v + 1]``, in their order."""
 
     def __init__(self, numbers: IntArray, size: int):
-        self.rows = order_by_number(numbers, size)
+        self.rows = order_by_number(numbers)
         self.begin = np.zeros(size + 1, dtype=np.int64)
         np.cumsum(np.bincount(numbers, minlength=size), out=self.begin[1:])
 

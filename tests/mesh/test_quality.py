@@ -241,7 +241,7 @@ def test_an_empty_mesh_has_no_shortest_edge():
 )
 def test_order_by_number_is_a_stable_sort(limit):
     numbers = np.random.default_rng(limit).integers(0, limit, 20_000)
-    np.testing.assert_array_equal(order_by_number(numbers, limit), np.argsort(numbers, kind="stable"))
+    np.testing.assert_array_equal(order_by_number(numbers), np.argsort(numbers, kind="stable"))
 
 
 @pytest.fixture

@@ -146,7 +146,7 @@ def _sort_along_curve(mesh: Mesh) -> tuple[Mesh, IntArray, IntArray]:
     number = np.empty(len(order), np.uint32)
     number[order] = np.arange(len(order), dtype=np.uint32)
     triangles = number[mesh.triangles]
-    order_of_faces = order_by_number(triangles.min(axis=1), len(order))
+    order_of_faces = order_by_number(triangles.min(axis=1))
     return Mesh(mesh.vertices[order], triangles[order_of_faces], None, {}, trusted=True), order, order_of_faces
 
 

@@ -77,7 +77,7 @@ def move_vertices(
     taken_back: Number of vertices that were not moved by the full step.
     """
     share = np.ones(len(vertices))
-    moved = as_stored(vertices + step)
+    moved = as_stored(np.add(vertices, step, out=np.empty_like(vertices), casting="same_kind"))
     marks = follow(moved, triangles)
     changed = np.ones(len(triangles), dtype=bool)
     spoilt: IntArray = (
@@ -122,7 +122,7 @@ class _Near:
         size = float(np.cbrt(np.prod(end - start + 1e-3) / (_CELL_SHARE * len(triangles))))
         x, y, z = ((column / size).astype(np.int32) for column in (low - start).T)
         cell = (x * (y.max() + 1) + y) * (z.max() + 1) + z
-        self._order = order_by_number(cell.take(triangles[:, 0]), int(cell.max()) + 1)
+        self._order = order_by_number(cell.take(triangles[:, 0]))
         rows = triangles.take(self._order, axis=0)
         starts = np.arange(0, len(rows), _IN_A_BLOCK)
         self._low = np.minimum.reduceat(find_boxes(low, rows)[0], starts)

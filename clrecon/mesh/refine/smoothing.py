@@ -93,7 +93,7 @@ class Rings:
         balance = np.bincount(corners, mixed.take(after) - mixed.take(before), vertex_count)
         weights = np.zeros(vertex_count, np.float32)
         np.divide(np.float32(1.0), degree.astype(np.float32), out=weights, where=(balance == 0.0) & (degree > 0))
-        order = order_by_number(corners, vertex_count)
+        order = order_by_number(corners)
         return cls(begin, after.take(order), before.take(order), weights)
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from clrecon import opencl as ocl
 from clrecon.mesh import Mesh
-from clrecon.mesh.connectivity import find_used, list_runs, number_used, order_by_number
+from clrecon.mesh.connectivity import find_used, list_runs, number_used, pack_numbers
 from clrecon.mesh.intersections import find_boxes, find_self_intersections
 from clrecon.mesh.refine import decimation
 from clrecon.opencl import Device
@@ -107,11 +107,13 @@ class CrossingPlan:
 
     def enter(self, part: slice) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
         """Return triangle and row of each entry of a part of the triangles: those of a row by their lowest x."""
-        by_x = np.argsort(self.steps[part], kind="stable")
-        first, wide, deep = self.rows[:, part].take(by_x, axis=1)
+        first, wide, deep = self.rows[:, part]
         rows = list_runs(list_runs(first, deep, np.int32(self.grid.last[1] + 1.0)), wide.repeat(deep))
-        order = order_by_number(rows, self.grid.rows)
-        return self.numbers[part].take(by_x).repeat(wide * deep).take(order), rows.take(order).astype(np.uint32)
+        packed = pack_numbers(self.steps[part], self.numbers[part]).repeat(wide * deep)
+        behind = np.uint64(31 + _BINS.bit_length())  # bits of a step and a triangle
+        packed |= rows.astype(np.uint64) << behind
+        packed.sort()
+        return packed.astype(np.uint32), (packed >> behind).astype(np.uint32)
 
 
 def plan_crossings(
