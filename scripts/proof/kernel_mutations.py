@@ -199,7 +199,7 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
         "neighbours": (("neighbours[entry + i] = own.vertices[i];", "neighbours[entry + i] = u;"),),
         "homes": (("homes[u] = home;", "homes[u] = count - 1u - home;"),),
     },
-    "frame_faces": {"frames": (("(float4)(one, 0.0f)", "(float4)(-one, 0.0f)"),)},
+    "frame_faces": {"frames": (("(float4)(one, max", "(float4)(-one, max"),)},
     "gather_stars": {"stars": (("star[0] = p.x;", "star[0] = -p.x;"),)},
     "find_near_faces": {"witnesses": (("(int4)(SEVERAL) : used", "(int4)(SEVERAL) : ~used"),)},
     "pair_faces": {

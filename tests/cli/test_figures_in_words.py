@@ -55,10 +55,11 @@ def test_gaps_between_slices_are_listed_by_their_runs_up_to_a_number(
 
 
 def test_patients_are_separated_by_a_line_in_the_table_of_series() -> None:
-    entries = [{"number": n, "patient": who} for n, who in enumerate(("a", "a", "b"), start=1)]
-    columns = [info._Column("series", [str(n) for n in (1, 2, 3)])]
-    table = info._make_table(columns, entries, chosen=1)
-    assert [row.end_section for row in table.rows] == [False, True, False]
+    missing = ("uid_hash", "phases", "shape_ijk", "spacing_mm", "extent_mm", "slice_thickness_mm", "tilt_deg")
+    known = {"study": 1, "kind": "stack", "modality": "CT", "slices": 9, "description": "", **dict.fromkeys(missing)}
+    entries = [{**known, "number": n, "patient": who} for n, who in enumerate((7, 7, 8), start=1)]
+    lines, _ = info._render_table(entries, 1, 200, styled=False)
+    assert [line.split()[-9:-8] for line in lines[2:]] == [["7"], ["7"], [], ["8"]]
 
 
 def test_words_of_distance_have_the_range_of_its_colours_and_the_share_beyond() -> None:

@@ -111,7 +111,6 @@ OPENING_MODULES = {
     "exchange/glb.py": "what it has just written",
     "exchange/obj.py": "what it has just written",
     "exchange/page.py": "what it has just written",
-    "jobs/view/inputs.py": "the head of a file that was looked at",
     "viewer/web/start_page.py": "new files in its own folder",
     "viewer/web/server.py": "files of the package, and what a session has just written",
     "exchange/ply.py": "what it has just written",
