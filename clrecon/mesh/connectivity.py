@@ -124,11 +124,11 @@ def order_by_number(numbers: IntArray) -> IntArray:
     return packed.astype(_index_type(len(numbers)))
 
 
-def pack_numbers(upper: IntArray, lower: NDArray[np.uint32]) -> NDArray[np.uint64]:
-    """Return numbers of 64 bits of which the upper half, from 0 to 2^32 - 1, counts first where they are sorted."""
+def pack_numbers(upper: IntArray, lower: IntArray) -> NDArray[np.uint64]:
+    """Return numbers of 64 bits, of which the upper half counts first in an order; both are from 0 to 2^32 - 1."""
     packed = upper.astype(np.uint64)
     packed <<= np.uint64(32)
-    packed |= lower
+    packed |= lower.astype(np.uint64, copy=False)
     return packed
 
 
@@ -219,9 +219,7 @@ def find_edges(triangles: NDArray[np.uint32], vertex_count: int) -> Edges:
         return Edges(**vars(edges) | {"ends": used.take(edges.ends)})
     start = triangles.reshape(-1)
     end = triangles[:, (1, 2, 0)].reshape(-1)
-    keys = np.minimum(start, end).astype(np.uint64)
-    keys <<= np.uint64(32)
-    keys |= np.maximum(start, end).astype(np.uint64)
+    keys = pack_numbers(np.minimum(start, end), np.maximum(start, end))
     keys <<= np.uint64(1)
     keys |= start > end
     is_loop = start == end
